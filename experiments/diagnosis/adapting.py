@@ -139,7 +139,10 @@ class Tuner:
         self.key = jax.random.key(seed)
         self.before = starting_parameters(loaded.parameters, loaded.settings)
         self.nominal = bounds_of({}, {}, rest=0.0)
-        compile_programs(self.adaptation, self.before, self.tasks[0], self.nominal)()
+        self.evaluate, ready = compile_programs(
+            self.adaptation, self.before, self.tasks[0], self.nominal
+        )
+        ready()
 
     def fly(self, parameters, bounds, part: int) -> dict[str, np.ndarray]:
         """Figures (B,) of a part's episodes; the same part draws the same ones."""
@@ -148,7 +151,7 @@ class Tuner:
         from openjax.evaluation.evaluator import episode_figures
 
         key = jax.random.fold_in(self.key, part)
-        flown = self.adaptation.evaluate(parameters, self.tasks[part], key, bounds)
+        flown = self.evaluate(parameters, self.tasks[part], key, bounds)
         return episode_figures(flown.statistics)
 
     def tuned(self, bounds):

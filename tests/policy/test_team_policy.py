@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from openjax import Pursuit, PursuitSettings
-from openjax.learning.learners.mappo import Batch, loss
+from openjax.learning.learners.mappo import loss
+from openjax.learning.learners.ppo import Samples
 from openjax.learning.settings import MappoSettings
 from openjax.policy import NetworkSettings, PredictorSettings, make_policy
 from tests.policy.parameters import random_parameters
@@ -94,17 +95,16 @@ def test_nothing_is_learnt_from_empty_slots(networks):
 
     def gradient(observation, action):
         number = action.shape[0]
-        batch = Batch(
-            observation=observation.replace(frames=None),
-            predicted=policy.predict(parameters, observation),
-            action=action,
+        predicted = policy.predict(parameters, observation)
+        samples = Samples(
+            inputs=(observation.replace(frames=None), predicted, action),
             log_prob=jnp.linspace(-1.0, 0.0, SIZE)[:number],
             advantage=jnp.linspace(-2.0, 5.0, SIZE)[:number],
             target=jnp.linspace(3.0, -1.0, SIZE)[:number],
         )
         networks = (parameters.actor, parameters.critic)
         return jax.grad(
-            lambda networks: loss(MappoSettings(), policy, networks, batch, jnp.asarray(0.2))[0]
+            lambda networks: loss(MappoSettings(), policy, networks, samples, jnp.asarray(0.2))[0]
         )(networks)
 
     action = 0.1 * jax.random.normal(jax.random.key(0), (SIZE, 4))

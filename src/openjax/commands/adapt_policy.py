@@ -21,6 +21,7 @@ from openjax.baselines import Heuristic
 from openjax.commands.adapt_report import FIGURES, WHICH, page
 from openjax.commands.options import AdaptCommand
 from openjax.errors import UserError
+from openjax.evaluation.episodes import make_evaluate_vehicles
 from openjax.evaluation.evaluator import episode_figures
 from openjax.evaluation.validation import selection_score, uniform_tasks
 from openjax.files import write_json, write_text
@@ -30,6 +31,7 @@ from openjax.learning.adaptation import make_adaptation
 from openjax.learning.adapting_game import bounds_of, starting_parameters
 from openjax.learning.fine_tuning import Look, fine_tune
 from openjax.learning.train_state import TrainState
+from openjax.pursuit import Pursuit
 from openjax.runs.machine import describe_machine
 from openjax.store.policies import load_policy
 from openjax.store.policy_files import save_policy_file
@@ -130,7 +132,7 @@ class _Programs:
         self._measured_on = jax.tree.map(lambda leaf: leaf[command.episodes :], tasks)
         self._parameters = starting_parameters(self.loaded.parameters, self.loaded.settings)
         self._nominal = bounds_of({}, {}, rest=0.0)
-        self.ready = compile_programs(
+        self._evaluate, self.ready = compile_programs(
             self.adaptation, self._parameters, self._chosen_by, self._nominal
         )
 
@@ -139,7 +141,7 @@ class _Programs:
         ones.
         """
         key = jax.random.fold_in(self._key, number)
-        return episode_figures(self.adaptation.evaluate(parameters, tasks, key, bounds).statistics)
+        return episode_figures(self._evaluate(parameters, tasks, key, bounds).statistics)
 
     def fine_tune(self, vehicle: _Diagnosed):
         """The best of the policy's updates (see
@@ -266,9 +268,10 @@ def _diagnosis(command: AdaptCommand) -> Iterator[Callable[[], Path]]:
 
 
 def compile_programs(adaptation, parameters, tasks, bounds):
-    """Start to compile flights, update and evaluation; a function that waits for
-    all.
+    """Start to compile flights, update and evaluation; the evaluation (parameters, tasks,
+    key, bounds), and a function that waits for all.
     """
+    evaluate = jax.jit(make_evaluate_vehicles(Pursuit(adaptation.game), adaptation.policy))
     key = jax.random.key(0)
     flights = jax.eval_shape(adaptation.fly, parameters, key, bounds)
     state = jax.eval_shape(adaptation.optimiser.init, parameters.actor)
@@ -276,7 +279,7 @@ def compile_programs(adaptation, parameters, tasks, bounds):
     # the update first: it takes longest
     waits = [
         compile_ahead(adaptation.update, actor, parameters, flights, key, bounds),
-        compile_ahead(adaptation.evaluate, parameters, tasks, key, bounds),
+        compile_ahead(evaluate, parameters, tasks, key, bounds),
         compile_ahead(adaptation.fly, parameters, key, bounds),
     ]
-    return lambda: [wait() for wait in waits]
+    return evaluate, lambda: [wait() for wait in waits]

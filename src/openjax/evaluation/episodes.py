@@ -58,6 +58,19 @@ def make_evaluate(
     return _Episodes(environment, policy, trajectory, hearsay).evaluate
 
 
+def make_evaluate_vehicles(
+    environment: Pursuit, policy: Policy
+) -> Callable[[PolicyParameters, Task, jax.Array, jax.Array], Evaluation]:
+    """The same as a function of the bounds (R, 4) of vehicles, too: `evaluate(parameters,
+    tasks, key, bounds)`.
+    """
+
+    def evaluate(parameters, tasks, key, bounds):
+        return make_evaluate(environment.with_bounds(bounds), policy)(parameters, tasks, key)
+
+    return evaluate
+
+
 @dataclass(frozen=True)
 class _Episodes:
     """Whole episodes of a policy, as one function of its parameters and tasks."""

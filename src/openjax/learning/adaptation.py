@@ -20,7 +20,6 @@ import optax
 from jaxtyping import Array, Float
 
 import openjax.baselines  # noqa: F401  registers its policies
-from openjax.evaluation.episodes import Evaluation, make_evaluate
 from openjax.learning.adapting_game import adapting_game
 from openjax.learning.drawn_starts import draw_start
 from openjax.learning.gradient_step import (
@@ -38,7 +37,7 @@ from openjax.learning.settings import AdaptSettings, TrainSettings
 from openjax.learning.smooth_measures import breach_share, crash_share, nearest_gap
 from openjax.learning.train_state import TrainState
 from openjax.policy import Policy, PolicyParameters, make_policy
-from openjax.pursuit import Pursuit, PursuitSettings, Task
+from openjax.pursuit import Pursuit, PursuitSettings
 from openjax.vehicle import Vehicle, load_vehicle
 
 NEAR_POSITION = 0.02
@@ -61,8 +60,6 @@ class Adaptation:
     """(actor, parameters, flights, key, bounds) -> actor, metrics; the actor with its
     optimiser's state, the parameters are the policy's before.
     """
-    evaluate: Callable[[PolicyParameters, Task, jax.Array, jax.Array], Evaluation]
-    """(parameters, tasks, key, bounds) -> one episode per task."""
 
 
 def make_adaptation(training: TrainSettings, settings: AdaptSettings) -> Adaptation:
@@ -75,7 +72,7 @@ def make_adaptation(training: TrainSettings, settings: AdaptSettings) -> Adaptat
     vehicle = load_vehicle(training.environment.airframe)
     worlds = settings.worlds or (8 if jax.default_backend() == "cpu" else 320)
     flights = NominalFlights(free, vehicle, policy, 4 * worlds)
-    stage = _Stage(settings, game, free, vehicle, policy, optimiser, worlds)
+    stage = _Stage(settings, free, vehicle, policy, optimiser, worlds)
     return Adaptation(
         settings,
         game,
@@ -83,7 +80,6 @@ def make_adaptation(training: TrainSettings, settings: AdaptSettings) -> Adaptat
         optimiser,
         fly=jax.jit(flights.fly),
         update=jax.jit(stage.update),
-        evaluate=jax.jit(stage.evaluate),
     )
 
 
@@ -92,7 +88,6 @@ class _Stage:
     """What the programs have in common."""
 
     settings: AdaptSettings
-    game: PursuitSettings
     free: PursuitSettings
     """The game in which is learnt."""
     vehicle: Vehicle
@@ -101,9 +96,9 @@ class _Stage:
     worlds: int
     """Of each kind of flight in an update."""
 
-    def pursuit(self, bounds, game=None):
-        """The game that is learnt in, or another one, with vehicles of the bounds."""
-        return Pursuit(game or self.free, self.vehicle, vehicle_bounds=bounds)
+    def pursuit(self, bounds):
+        """The game that is learnt in, with vehicles of the bounds."""
+        return Pursuit(self.free, self.vehicle, vehicle_bounds=bounds)
 
     def _begin(self, flights, key, bounds):
         """Half of the worlds at starts, half in flight, all with vehicles of the
@@ -168,11 +163,6 @@ class _Stage:
             actor.parameters, parameters, flights, key, bounds
         )
         return actor.update(self.optimiser, finite_or_zero(gradient)), watch
-
-    def evaluate(self, parameters, tasks, key, bounds):
-        """One episode per task, with vehicles of the bounds."""
-        pursuit = self.pursuit(bounds, self.game)
-        return make_evaluate(pursuit, self.policy)(parameters, tasks, key)
 
 
 def off_the_flight(

@@ -13,7 +13,7 @@ def generalised_advantages(
     next_value: Float[Array, " steps *worlds"],
     terminated: Bool[Array, " steps *worlds"],
     truncated: Bool[Array, " steps *worlds"],
-    discount: float,
+    discount: float | Float[Array, "..."],
     trace: float,
 ) -> Float[Array, " steps *worlds"]:
     """Advantages of consecutive steps.
@@ -25,7 +25,7 @@ def generalised_advantages(
       terminated: the episode ended for good: nothing comes after.
       truncated: the episode was cut: the value of the state it led to stands for the
       rest.
-      discount: gamma.
+      discount: gamma; of all, or of each world.
       trace: lambda.
     """
     # a cut episode has a value after it but no advantage: what came next is another

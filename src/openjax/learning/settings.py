@@ -120,7 +120,7 @@ class GeneratorSettings:
 
 @dataclass(frozen=True)
 class EvaderLearningSettings:
-    """PPO of evaders that learn; see `openjax.learning.evader_learning`."""
+    """PPO of evaders that learn; see `openjax.learning.learners.evasion`."""
 
     learning_rate: Annotated[float, Interval("(0, 1]")] = 1e-3
     """Adam step size at the start of the run."""

@@ -17,7 +17,6 @@ from jaxtyping import PRNGKeyArray
 import openjax.baselines  # noqa: F401  registers its policies
 from openjax.learning.archive import TaskArchive, empty_archive
 from openjax.learning.collectives import gather_over_devices, mean_over_devices, own_keys
-from openjax.learning.evader_learning import EvaderLearning
 from openjax.learning.generator import generate_task, select, successes, task_like
 from openjax.learning.learners.evasion import EvaderLearner
 from openjax.learning.learners.learner import Flown, Learner, check_learners, check_learning
@@ -99,9 +98,9 @@ def shipped_learners(
     updates = settings.total_updates
     if policy.predictor.enabled:
         learners["predictor"] = PredictorLearner(policy, environment.settings, updates)
-    evaders = EvaderLearning(settings.evader_learning, environment, updates)
+    evaders = EvaderLearner(settings.evader_learning, environment, updates)
     if evaders.number:
-        learners["evaders"] = EvaderLearner(evaders)
+        learners["evaders"] = evaders
     return {**learners, "policy": Mappo(settings.mappo, policy, updates)}
 
 

@@ -25,6 +25,16 @@ from openjax.evaluation.judges.duel import Duel, World, copies
 from openjax.evaluation.judges.networks import apply_network, init_network, likeliest, of_way, ways
 from openjax.evaluation.judges.senses import sense, to_world
 from openjax.evaluation.judges.settings import BestResponseSettings
+from openjax.learning.advantages import generalised_advantages
+from openjax.learning.learners.ppo import (
+    Answer,
+    Objective,
+    Samples,
+    for_many,
+    gradient_steps,
+    normalise,
+)
+from openjax.learning.train_state import TrainState, clipped_adam, shuffle
 from openjax.policy import PolicyParameters
 from openjax.pursuit import EpisodeStatistics, PursuitSettings, PursuitState, Task
 from openjax.pursuit.rows import where_rows
@@ -108,7 +118,7 @@ class BestResponse:
         """
         settings = self.settings
         rate = optax.linear_schedule(settings.learning_rate, 0.0, settings.gradient_steps)
-        return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, eps=1e-5))
+        return for_many(clipped_adam(1.0, rate))
 
     @property
     def game(self) -> PursuitSettings:
@@ -135,7 +145,7 @@ class BestResponse:
             world_axes=jnp.arange(learners) % 2 == 1,
             discount=jnp.asarray(self.settings.discounts(self.game.time_step), jnp.float32),
         )
-        return ResponseCarry(evaders, jax.vmap(self.optimiser.init)(evaders.networks), world, key)
+        return ResponseCarry(evaders, self.optimiser.init(evaders.networks), world, key)
 
     def step(
         self, parameters: PolicyParameters, carry: ResponseCarry
@@ -210,87 +220,76 @@ class BestResponse:
         """The evaders and their optimiser after all epochs."""
         settings = self.settings
         evaders = carry.evaders
-        batch = self._batch(evaders, decisions, state)
-        size = batch["free"].shape[1] // settings.minibatches
+        samples = self._samples(evaders, decisions, state)
 
-        def epoch(networks_and_state, key):
-            order = jax.random.permutation(key, batch["free"].shape[1])
-            rows = jax.tree.map(lambda leaf: leaf[:, order], batch)
+        def gradient(parameters, place):
+            part = jax.tree.map(lambda leaf: leaf[:, place], samples)
+            return (jax.grad(self._loss)(parameters[0], part),), {}
 
-            def update(networks_and_state, i):
-                networks, state = networks_and_state
-
-                def part(leaf):
-                    return jax.lax.dynamic_slice_in_dim(leaf, i * size, size, axis=1)
-
-                gradient = jax.grad(self._loss)(networks, jax.tree.map(part, rows))
-                change, state = jax.vmap(self.optimiser.update)(gradient, state, networks)
-                return (optax.apply_updates(networks, change), state), None
-
-            indices = jnp.arange(settings.minibatches)
-            return jax.lax.scan(update, networks_and_state, indices)[0], None
-
-        start = evaders.networks, carry.optimiser
-        keys = jax.random.split(key, settings.epochs)
-        (networks, optimiser), _ = jax.lax.scan(epoch, start, keys)
-        actor, critic, log_std = networks
+        order = shuffle(key, settings.epochs, samples.log_prob.shape[1])
+        (learnt,), _ = gradient_steps(
+            (TrainState(evaders.networks, carry.optimiser),),
+            (self.optimiser,),
+            gradient,
+            order.reshape(settings.epochs * settings.minibatches, -1),
+        )
+        actor, critic, log_std = learnt.parameters
         log_std = jnp.maximum(log_std, settings.least_log_std)
-        return evaders.replace(actor=actor, critic=critic, log_std=log_std), optimiser
+        return evaders.replace(actor=actor, critic=critic, log_std=log_std), learnt.optimiser
 
-    def _batch(self, evaders, decisions, state):
-        """(L, T * E, ...) by name: what the loss needs."""
+    def _samples(self, evaders, decisions, state):
+        """(L, T * E, ...) what is learnt from."""
+        settings = self.settings
         senses = self._by_learner(decisions.senses)  # (T, L, E, F)
         of_steps = jax.vmap(lambda senses: apply_network(evaders.critic, senses)[..., 0])
         value = of_steps(senses)  # (T, L, E)
         last = apply_network(evaders.critic, _sense(self.game, evaders, state))[..., 0]
         discount = evaders.discount[:, None]
-        free = self._by_learner(decisions.free)
         over = self._by_learner(decisions.over)
-
-        def back(carry, step):
-            advantage, following = carry
-            free, over, value = step
+        advantage = generalised_advantages(
             # values are shares of the time to come: at most one
-            target = (1.0 - discount) * free + discount * jnp.where(over, 0.0, following)
-            trace = discount * self.settings.gae_lambda * jnp.where(over, 0.0, advantage)
-            advantage = target - value + trace
-            return (advantage, value), advantage
-
-        start = (jnp.zeros_like(last), last)
-        advantage = jax.lax.scan(back, start, (free, over, value), reverse=True)[1]
-        deviation = advantage - jnp.mean(advantage, (0, 2), keepdims=True)
-        normal = deviation / (jnp.std(advantage, (0, 2), keepdims=True) + 1e-8)
-        rows = {
-            "sensed": senses,
-            "way": self._by_learner(decisions.way),
-            "sample": self._by_learner(decisions.sample),
-            "log_prob": self._by_learner(decisions.log_prob),
-            "free": free,
-            "advantage": normal,
-            "target": advantage + value,
-        }
+            (1.0 - discount) * self._by_learner(decisions.free),
+            value,
+            jnp.concatenate([value[1:], last[None]]),
+            over,
+            jnp.zeros_like(over),
+            discount,
+            settings.gae_lambda,
+        )
+        samples = Samples(
+            inputs=(senses, self._by_learner(decisions.way), self._by_learner(decisions.sample)),
+            log_prob=self._by_learner(decisions.log_prob),
+            # of each learner
+            advantage=normalise(advantage, lambda x: jnp.mean(x, (0, 2), keepdims=True)),
+            target=advantage + value,
+        )
 
         def flat(leaf):
             by_learner = jnp.moveaxis(leaf, 0, 1)
             return by_learner.reshape(by_learner.shape[0], -1, *by_learner.shape[3:])
 
-        return jax.tree.map(flat, rows)
+        return jax.tree.map(flat, samples)
 
     def _loss(self, networks, part):
         """(), the sum over learners: none's gradient knows of another."""
         settings = self.settings
         actor, critic, log_std = networks
-        means, odds = ways(apply_network(actor, part["sensed"]))
-        log_prob = _log_prob(part["way"], part["sample"], means, odds, log_std[:, None])
-        ratio = jnp.exp(log_prob - part["log_prob"])
-        near = jnp.clip(ratio, 1.0 - settings.clip_epsilon, 1.0 + settings.clip_epsilon)
-        surrogate = jnp.minimum(ratio * part["advantage"], near * part["advantage"])
-        value = apply_network(critic, part["sensed"])[..., 0]
-        # a value is at most one, an advantage of one standard deviation some hundredths
-        error = settings.value_coefficient * (value - part["target"]) ** 2
+        senses, way, sample = part.inputs
+        means, odds = ways(apply_network(actor, senses))
         spread_out = jnp.sum(log_std, -1) - jnp.mean(jnp.sum(jnp.exp(odds) * odds, -1), axis=1)
-        entropy = settings.entropy_coefficient * spread_out
-        return jnp.sum(jnp.mean(error - surrogate, axis=1) - entropy)
+        answer = Answer(
+            log_prob=_log_prob(way, sample, means, odds, log_std[:, None]),
+            value=apply_network(critic, senses)[..., 0],
+            bonus=settings.entropy_coefficient * spread_out,
+        )
+        # a value is at most one, an advantage of one standard deviation some hundredths
+        objective = Objective(
+            lambda x: jnp.mean(x, axis=1),
+            settings.clip_epsilon,
+            optax.squared_error,
+            settings.value_coefficient,
+        )
+        return jnp.sum(objective.loss(answer, part)[0])
 
 
 def fly_learners(

@@ -14,10 +14,16 @@ from jaxtyping import PRNGKeyArray
 from openjax.learning.advantages import generalised_advantages
 from openjax.learning.collectives import joint_moments, minibatches
 from openjax.learning.learners.learner import Flown
+from openjax.learning.learners.ppo import (
+    Answer,
+    Objective,
+    Samples,
+    gradient_steps,
+    normalise,
+)
 from openjax.learning.settings import MappoSettings
 from openjax.learning.train_state import TrainState, clipped_adam, shuffle
 from openjax.policy import OwnPolicy, Policy, PolicyParameters, gaussian_entropy, gaussian_log_prob
-from openjax.pursuit import Observation
 from openjax.pursuit.shapes import Scalar
 from openjax.pursuit.teams import team_mean
 
@@ -47,18 +53,6 @@ def initial_value_scale() -> ValueScale:
     """No returns seen."""
     zero = jnp.zeros((), jnp.float32)
     return ValueScale(mean=zero, square=zero, weight=zero)
-
-
-@struct.dataclass
-class Batch:
-    """Samples of the policy update; leading axes alike."""
-
-    observation: Observation
-    predicted: jax.Array | None  # (..., K, 3)
-    action: jax.Array  # (..., N, A)
-    log_prob: jax.Array  # (..., N)
-    advantage: jax.Array  # (..., N)
-    target: jax.Array  # (..., N) normalised returns
 
 
 WATCHED = ("policy_loss", "value_loss", "kl", "clipped", "entropy", "actor_gradient")
@@ -126,38 +120,30 @@ def loss(
     settings: MappoSettings,
     policy: Policy | OwnPolicy,
     parameters: tuple[Any, Any],
-    batch: Batch,
+    samples: Samples,
     clip: jax.Array | float,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Sum of actor's and critic's () loss, `parameters` (actor, critic); and what to
     watch.
 
-    The actor's is the surrogate, its ratio clipped to 1 +- `clip` (), minus the entropy
-    bonus; the critic's the Huber loss of normalised values. Unless they share an
-    encoder, neither's gradient knows of the other. Means are those of pursuers that are
-    there.
+    The ratio is clipped to 1 +- `clip` (); the values' loss is the Huber loss of
+    normalised ones. Unless actor and critic share an encoder, neither's gradient knows
+    of the other. Means are those of pursuers that are there.
     """
+    observation, predicted, action = samples.inputs
     actor, critic = parameters
-    mean, log_std, value = policy.evaluate(actor, critic, batch.observation, batch.predicted)
-    log_ratio = gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob
-    ratio = jnp.exp(log_ratio)
-    clipped_ratio = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
-    mean_of = functools.partial(team_mean, batch.observation.active)
-    # the lesser of both: a pessimistic bound (Schulman et al., 2017, section 3)
-    surrogate = mean_of(jnp.minimum(ratio * batch.advantage, clipped_ratio * batch.advantage))
+    mean, log_std, value = policy.evaluate(actor, critic, observation, predicted)
+    log_prob = gaussian_log_prob(action, mean, log_std)
     entropy = gaussian_entropy(log_std)
-    policy_loss = -surrogate - settings.entropy_coefficient * entropy
-    value_loss = mean_of(optax.huber_loss(value, batch.target, delta=settings.huber))
-    watch = {
-        # the same mean as that of -log_ratio, with less noise and never negative
-        # (Schulman 2020, Approximating KL divergence)
-        "kl": mean_of(ratio - 1.0 - log_ratio),
-        "clipped": mean_of(jnp.abs(ratio - 1.0) > clip),
-        "entropy": entropy,
-        "policy_loss": policy_loss,
-        "value_loss": value_loss,
-    }
-    return policy_loss + settings.value_coefficient * value_loss, watch
+    answer = Answer(log_prob, value, settings.entropy_coefficient * entropy)
+    objective = Objective(
+        mean=functools.partial(team_mean, observation.active),
+        clip=clip,
+        value_error=functools.partial(optax.huber_loss, delta=settings.huber),
+        value_coefficient=settings.value_coefficient,
+    )
+    total, terms = objective.loss(answer, samples)
+    return total, objective.watch(terms) | {"entropy": entropy}
 
 
 class Estimates(NamedTuple):
@@ -213,11 +199,10 @@ class Mappo:
         # by the moments with these returns in them: values and targets are then of one
         # scale
         targets = (estimates.returns - mean) / std
-        batch = self._batch(estimates.advantage, targets, experience)
-
+        samples = self._samples(estimates.advantage, targets, experience)
         actor = TrainState(parameters.actor, state.actor)
         critic = TrainState(parameters.critic, state.critic)
-        (actor, critic), metrics = self._epochs((actor, critic), batch, experience, key)
+        (actor, critic), metrics = self._epochs((actor, critic), samples, experience, key)
         parameters = parameters.replace(actor=actor.parameters, critic=critic.parameters)
         metrics["explained_variance"] = estimates.explained_variance
         metrics["value_scale"] = std
@@ -275,63 +260,56 @@ class Mappo:
             weight=decay * scale.weight + (1 - decay),
         )
 
-    def _batch(self, advantage, targets, experience):
+    def _samples(self, advantage, targets, experience):
         """The rollout's samples with advantages and targets (T, E, N), minibatch by
         minibatch, (M, W, T, ...).
         """
         rollout = experience.rollout
-        # over the whole rollout, not in each minibatch, whose moments are noisier
-        mean, std = joint_moments(advantage, experience.axis, rollout.observation.active)
-        batch = Batch(
-            observation=rollout.observation.replace(frames=None),
-            predicted=rollout.predicted,
-            action=rollout.action,
+        active = rollout.observation.active
+        samples = Samples(
+            inputs=(rollout.observation.replace(frames=None), rollout.predicted, rollout.action),
             log_prob=rollout.log_prob,
-            advantage=(advantage - mean) / (std + 1e-8),
+            # over the whole rollout, not in each minibatch, whose moments are noisier
+            advantage=normalise(advantage, lambda x: experience.mean(team_mean(active, x))),
             target=targets,
         )
-        return minibatches(batch, self.settings.minibatches)
+        return minibatches(samples, self.settings.minibatches)
 
-    def _epochs(self, networks, batch, experience, key):
-        """Actor and critic (`TrainState`s) after all gradient steps, and the means of
-        what was watched.
+    def _epochs(self, networks, samples, experience, key):
+        """Actor and critic with their optimisers' states after all gradient steps, and
+        the means of what was watched.
         """
         settings = self.settings
-        actor, critic = networks
         change = settings.clip_epsilon_end - settings.clip_epsilon
         clip = settings.clip_epsilon + change * experience.progress
         # each network as one vector while it learns: leaf by leaf, a step on a GPU is
         # forty kernels more
+        actor, critic = networks
         actor_vector, to_actor = ravel_pytree(actor.parameters)
         critic_vector, to_critic = ravel_pytree(critic.parameters)
 
-        def gradient_step(carry, step):
-            actor, critic = carry
+        def gradient(vectors, step):
             index, first = step
             part = jax.tree.map(
-                lambda x: every_nth(x[index], first, settings.step_subsampling), batch
+                lambda x: every_nth(x[index], first, settings.step_subsampling), samples
             )
 
             def part_loss(actor, critic):
                 parameters = (to_actor(actor), to_critic(critic))
                 return loss(settings, self.policy, parameters, part, clip)
 
-            gradient = jax.grad(part_loss, argnums=(0, 1), has_aux=True)(
-                actor.parameters, critic.parameters
-            )
+            actor, critic = vectors
+            gradients = jax.grad(part_loss, argnums=(0, 1), has_aux=True)(actor, critic)
             # gradients and what is watched over all devices by one collective
-            (actor_gradient, critic_gradient), watch = experience.mean(gradient)
-            watch |= {"actor_gradient": jnp.linalg.norm(actor_gradient)}
-            actor = actor.update(self.optimisers[0], actor_gradient, kl=watch["kl"])
-            critic = critic.update(self.optimisers[1], critic_gradient)
-            return (actor, critic), jnp.stack([watch[name] for name in WATCHED])
+            gradients, watch = experience.mean(gradients)
+            return gradients, watch | {"actor_gradient": jnp.linalg.norm(gradients[0])}
 
-        steps = self._order(key)
-        start = (actor.replace(parameters=actor_vector), critic.replace(parameters=critic_vector))
-        (actor, critic), measures = jax.lax.scan(gradient_step, start, steps)
+        vectors = (actor.replace(parameters=actor_vector), critic.replace(parameters=critic_vector))
+        (actor, critic), metrics = gradient_steps(
+            vectors, self.optimisers, gradient, self._order(key), WATCHED
+        )
         actor = actor.replace(parameters=to_actor(actor.parameters))
         critic = critic.replace(parameters=to_critic(critic.parameters))
-        metrics = dict(zip(WATCHED, jnp.mean(measures, axis=0), strict=True))
         return (actor, critic), metrics
 
     def _order(self, key):

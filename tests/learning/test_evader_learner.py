@@ -12,9 +12,10 @@ import pytest
 
 from openjax import make
 from openjax.errors import UserError
-from openjax.learning.evader_learning import EvaderLearning
+from openjax.learning.learners.evasion import EvaderLearner
 from openjax.learning.presets import preset
 from openjax.learning.settings import EvaderLearningSettings
+from openjax.policy import PolicyParameters
 from openjax.pursuit import uniform_task
 from openjax.pursuit.evaders import init_network, scene_of
 from openjax.pursuit.evaders.learned import STEPS, features, outputs, outputs_of
@@ -24,9 +25,10 @@ ENVIRONMENT = make(
     evaders=("field", "learned", "greedy", "learned"), physics="stops", max_pillars=5
 )
 HOW = EvaderLearningSettings(epochs=4, learning_rate=3e-3, initial_log_std=0.0)
-LEARNING = EvaderLearning(HOW, ENVIRONMENT, updates=1)
+LEARNING = EvaderLearner(HOW, ENVIRONMENT, updates=1)
+PURSUERS = PolicyParameters(actor={}, critic={}, predictor={})
 act = jax.jit(LEARNING.act)
-learn = jax.jit(LEARNING.learn)
+learn = jax.jit(LEARNING.improve)
 
 
 @pytest.fixture(scope="module")
@@ -44,14 +46,14 @@ def worlds():
 @pytest.fixture(scope="module")
 def start():
     """The two networks before they learn."""
-    return jax.jit(LEARNING.start)(jax.random.key(1))
+    return jax.jit(LEARNING.start)(PURSUERS, jax.random.key(1))
 
 
 def test_each_learns_from_its_own_samples_what_pays(worlds, start):
     """Network 1 is caught at once where it flies to the left, network 0 whatever it
     does.
     """
-    learning = EvaderLearning(HOW, ENVIRONMENT, updates=30)
+    learning = EvaderLearner(HOW, ENVIRONMENT, updates=30)
 
     @jax.jit
     def improve(evaders, key):
@@ -61,7 +63,7 @@ def test_each_learns_from_its_own_samples_what_pays(worlds, start):
         caught = (samples.which == 0) | (samples.sample[:, 0] < 0.0)
         last = worlds.replace(statistics=worlds.statistics.replace(captured=caught))
         samples = jax.tree.map(lambda leaf: leaf[None], samples)
-        return learning.learn(evaders, samples, last, order_key), caught
+        return learning.improve(evaders, samples, last, order_key), caught
 
     evaders = start
     for key in jax.random.split(jax.random.key(2), 30):
@@ -95,18 +97,18 @@ def test_a_network_without_a_world_stays_as_it_is(worlds, start):
 
 def test_a_network_that_flies_all_worlds_learns_as_if_alone(worlds):
     """Beside another one it gets its worlds some at a time."""
-    alone = EvaderLearning(
+    alone = EvaderLearner(
         HOW, make(evaders=("learned",), physics="stops", max_pillars=5), updates=1
     )
     ended = worlds.replace(statistics=worlds.statistics.replace(captured=jnp.ones(WORLDS, bool)))
-    one = jax.jit(alone.start)(jax.random.key(1))
+    one = jax.jit(alone.start)(PURSUERS, jax.random.key(1))
     kinds = worlds.evader.replace(kind=jnp.zeros(WORLDS, jnp.int32))
     samples = jax.jit(alone.act)(one, worlds.replace(evader=kinds), jnp.ones((WORLDS, 3)))[1]
     samples = jax.tree.map(lambda leaf: leaf[None], samples)
     two = jax.tree.map(lambda leaf: jnp.repeat(leaf, 2, axis=0), one)
     ends = [
         step(first, samples, ended, jax.random.key(2))
-        for step, first in ((jax.jit(alone.learn), one), (learn, two))
+        for step, first in ((jax.jit(alone.improve), one), (learn, two))
     ]
     for mine, its in zip(*(jax.tree.leaves(end.networks) for end in ends), strict=True):
         np.testing.assert_allclose(its[0], mine[0], atol=1e-5)
@@ -196,8 +198,8 @@ def test_earlier_selves_fly_and_learn_nothing(worlds):
     and it becomes what the first was when it was drawn.
     """
     how = dataclasses.replace(HOW, past=1, pool=2, pool_every=1)
-    learning = EvaderLearning(how, ENVIRONMENT, updates=4)
-    start = jax.jit(learning.start)(jax.random.key(1))
+    learning = EvaderLearner(how, ENVIRONMENT, updates=4)
+    start = jax.jit(learning.start)(PURSUERS, jax.random.key(1))
 
     @jax.jit
     def improve(evaders, key, shift):
@@ -207,7 +209,7 @@ def test_earlier_selves_fly_and_learn_nothing(worlds):
         samples = jax.tree.map(lambda leaf: leaf[None], samples)
         caught = samples.sample[0, :, 0] < 0.0
         last = worlds.replace(statistics=worlds.statistics.replace(captured=caught))
-        return learning.learn(evaders, samples, last, key)
+        return learning.improve(evaders, samples, last, key)
 
     assert learning.number == 1
     evaders = start
