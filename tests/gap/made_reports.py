@@ -34,11 +34,13 @@ def flights_of(day, factors=(1.0, 1.0, 1.0, 1.0)):
     return out
 
 
+OLD = [flight for day in ("monday", "friday") for flight in flights_of(day)]
+
+
 def change(rise, rotors=(2,)):
     """What trims say of rotors that need so much more."""
     factors = [1.0 + rise * (rotor in rotors) for rotor in range(4)]
-    old = [flight for day in ("monday", "friday") for flight in flights_of(day)]
-    return change_between("tuesday", flights_of("new", factors), old, CASE)
+    return change_between("tuesday", flights_of("new", factors), OLD, CASE)
 
 
 def identification(ratio=1.0, error=0.03, lag=0.025, lag_error=0.1, trusted=True):

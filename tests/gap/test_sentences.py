@@ -23,9 +23,18 @@ from openjax.gap.report.page import page_of
 from openjax.gap.report.report import VERDICTS_SINCE
 from openjax.gap.report.rules import broken_rules
 from openjax.gap.shares import Gap
+from openjax.gap.trims import change_between
 from openjax.gap.where import without_nuisances
 from openjax.vehicle.effects import EFFECTS
-from tests.gap.made_reports import VEHICLE, change, identification, report
+from tests.gap.made_reports import (
+    CASE,
+    OLD,
+    VEHICLE,
+    change,
+    flights_of,
+    identification,
+    report,
+)
 
 NAMED = {
     "nothing": {},
@@ -76,6 +85,10 @@ def test_one_page_has_one_verdict_beside_a_reference():
     names = ("motor_imbalance", "rotor_drag")
     assert trimmed_before(theta, names, known, VEHICLE, quiet) == {"motor_imbalance"}
     assert trimmed_before(theta, names, known, VEHICLE, weak) == set()
+    # a centre of mass that moved has the pattern of no rotor, and is more than a day's
+    offset = change_between("new", flights_of("new", (1.07, 0.97, 0.93, 1.03)), OLD, CASE)
+    assert offset.trims_differ
+    assert trimmed_before(theta, names, known, VEHICLE, offset) == set()
     calm = dataclasses.replace(report(), reference=SINCE, trims=quiet)
     assert calm.title == "no change" and "as in its reference" in calm.headline()
     assert not any("No change beyond" in line for line in calm.in_words())

@@ -117,7 +117,7 @@ def trimmed_before(
     if baseline is None or not trims:
         return set()
     if change is not None:
-        return set() if change.trims_changed else trims
+        return set() if change.trims_differ or change.trims_changed else trims
     trim = trim_of(theta, trims, vehicle)
     same = np.linalg.norm(trim - baseline.trim) < 0.5 * np.linalg.norm(trim)
     return trims if same else set()

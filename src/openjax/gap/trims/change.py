@@ -77,6 +77,15 @@ class Change:
         return self.changed and not CAUSES[self.likely_causes[0]].figures
 
     @property
+    def trims_differ(self) -> bool:
+        """Whether a trim differs by more than days do, whatever the cause."""
+        return any(
+            not self.figures[name].low <= 0.0 <= self.figures[name].high
+            for name in TRIMS
+            if name in self.figures
+        )
+
+    @property
     def effects(self) -> tuple[str, ...]:
         """What changed by the names of the effect library, the most probable first."""
         if not self.changed:
