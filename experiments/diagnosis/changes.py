@@ -16,6 +16,7 @@ docs/what_changed.md into `--work` instead.
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.sample_flights import Arguments, make_case
@@ -26,8 +27,9 @@ from openjax.flights.manoeuvres import references
 from openjax.flights.samples import fly, log_of
 from openjax.gap.folders import diagnose_folder
 from openjax.gap.report import Report
-from openjax.gap.report.trims_page import draw
+from openjax.gap.report.trims_page import draw_places, draw_trim
 from openjax.gap.trims import Change, change_between, compare, read
+from openjax.gap.trims.figures import TRIMS
 from openjax.vehicle import load_vehicle
 
 EFFECTS = ("motor_lag", "mass", "rotor_drag", "rate_gains", "none")
@@ -190,7 +192,21 @@ def figure(folder: Path) -> None:
     change = compare(
         read_folder(folder / "tuesday"), [read_folder(folder / d) for d in ("friday", "monday")]
     )
-    draw(change).savefig(folder / "what_changed.png", dpi=90)
+    _draw(change).savefig(folder / "what_changed.png", dpi=90)
+
+
+def _draw(change: Change) -> Figure:
+    """Trims of every flight, day by day, and where the change would be."""
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    axes = figure.subplots(1, 5, width_ratios=(1, 1, 1, 1, 1.3))
+    level = np.mean([f.values["hover"][0] for f in change.reference])
+    for axis, name in zip(axes, TRIMS, strict=False):
+        draw_trim(axis, change, name, level)
+        axis.set(title=name)
+    axes[0].set_ylabel("% of hover (band: 90 % of normal days)")
+    draw_places(axes[4], change)
+    axes[4].set(title="probability")
+    return figure
 
 
 def main() -> None:

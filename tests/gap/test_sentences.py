@@ -18,8 +18,8 @@ from openjax.gap.model.library import ABSENT, PLACE
 from openjax.gap.planning.beliefs import sentence
 from openjax.gap.probabilities import agreeing
 from openjax.gap.reference import trimmed_before
-from openjax.gap.report import VERDICTS, Estimate
-from openjax.gap.report.page import page_of
+from openjax.gap.report import VERDICTS, Estimate, to_fly
+from openjax.gap.report.page import next_steps, page_of
 from openjax.gap.report.report import VERDICTS_SINCE
 from openjax.gap.report.rules import broken_rules
 from openjax.gap.shares import Gap
@@ -64,6 +64,10 @@ def test_every_sentence_agrees_with_every_other(named, measured, trims):
     parts = {"identification": MEASURED[measured], "trims": TRIMS[trims], "reference": reference}
     made = dataclasses.replace(made, **parts)
     assert broken_rules(made) == []
+    advice = " ".join(why for why, _ in next_steps(made))
+    agrees = made.headline() in (VERDICTS["none"], VERDICTS_SINCE["none"])
+    assert ("Nothing needs correcting" in advice) == agrees == made.agrees
+    assert ("mend it" in advice) == ("rotor 3" in made.headline())
     if measured != "slow motors":
         return  # a page takes longer to draw than to read
     page = page_of(made)
@@ -132,6 +136,8 @@ def test_a_report_that_names_nothing_tells_of_numbers_that_differ():
 def test_an_interval_over_more_than_a_factor_of_ten_is_no_size():
     wide = Estimate(3.0, "1", (0.05, 20.0), (0.7, 1.6))
     assert "between 0.05 and 20, which is no size" in wide.in_words("zz")
+    inertia = dataclasses.replace(report(), parameters={"inertia": {"zz": wide}})
+    assert to_fly(inertia)[0]["inertia"]["zz"] == 1.0
     assert Estimate(3.0, "1", (1.0, 9.0), (0.7, 1.6)).is_size
     assert Estimate(0.1, "N", (-0.1, 0.3), (0.0, 1.0)).is_size
 

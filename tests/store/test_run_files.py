@@ -1,6 +1,7 @@
 """Settings, metrics, policies and pictures on disk."""
 
 import dataclasses
+import json
 import os
 import pickle
 from typing import Literal
@@ -104,6 +105,24 @@ def test_policy_file_round_trip(tmp_path):
         UserError, match=r"actor/kernel is \[2, 3\] there, its settings make it \[2, 4\]"
     ):
         fill({"actor": {"kernel": jnp.zeros((2, 4))}}, leaves, str(path))
+
+
+def test_arrays_that_somebody_changed_are_refused(tmp_path):
+    """A transposed matrix of the same shape, or leaves beside those that were written."""
+    path = tmp_path / "policy.npz"
+    save_policy_file(path, {"kernel": jnp.arange(4.0).reshape(2, 2)}, Outer())
+    with np.load(path) as npz:
+        arrays = dict(npz)
+    for changed in ({"kernel": arrays["kernel"].T}, {"more": np.zeros(3)}):
+        np.savez(tmp_path / "changed.npz", **(arrays | changed))
+        with pytest.raises(UserError, match=r"aren't those that openjax\.train wrote"):
+            load_policy_file(tmp_path / "changed.npz")
+    # a file of before, which says nothing of its arrays, is still read
+    header = json.loads(arrays["openjax.json"].tobytes())
+    del header["digest"]
+    plain = {"openjax.json": np.frombuffer(json.dumps(header).encode(), np.uint8)}
+    np.savez(path, **(arrays | plain))
+    assert list(load_policy_file(path)[0]) == ["kernel"]
 
 
 def test_pickle_is_refused_as_a_policy(tmp_path):

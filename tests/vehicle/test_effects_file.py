@@ -7,7 +7,7 @@ import pytest
 
 from openjax.errors import UserError
 from openjax.vehicle.effects import EFFECTS, load_effects, save_effects
-from openjax.vehicle.effects.effects_file import load_intervals
+from openjax.vehicle.effects.effects_file import load_intervals, unusual_values
 from tests.vehicle.typical import typical
 
 
@@ -15,12 +15,12 @@ def test_everything_comes_back(tmp_path):
     path = tmp_path / "effects.toml"
     written = {name: typical(effect) for name, effect in EFFECTS.items()}
     save_effects(
-        path, written, intervals={"rotor_drag": {"d_xy": (0.01, 0.02)}}, notes="three flights"
+        path, written, intervals={"rotor_drag": {"d_xy": (0.01, 0.03)}}, notes="three flights"
     )
     names, read = load_effects(path)
     assert names == tuple(sorted(EFFECTS)) and read == written
     text = path.read_text()
-    assert 'unit = "N s/m"' in text and "interval90 = [0.01, 0.02]" in text
+    assert 'unit = "N s/m"' in text and "interval90 = [0.01, 0.03]" in text
     assert [file.name for file in tmp_path.iterdir()] == ["effects.toml"]
 
 
@@ -47,6 +47,10 @@ def test_bare_numbers_and_missing_parameters(tmp_path):
         ('[rotor_drag]\nd_xy = "0.01"\n', "expected a number"),
         ("[rotor_drag]\nd_xy = nan\n", "expected a finite number"),
         ("[rotor_drag]\nd_xy = {}\n", "lacks value"),
+        (
+            "[rotor_drag]\nd_xy = { value = 0.03, interval90 = [0.01, 0.02] }\n",
+            "lies outside its interval90",
+        ),
         ("[rotor_drag]\nd_xy = 1e30\n", "far from what occurs"),
         ("x = " + "[" * 5000 + "]" * 5000, "nested more than"),
         ("[rotor_drag\n", "not readable as TOML"),
@@ -120,3 +124,11 @@ def test_the_folder_of_a_diagnosis_is_answered_with_the_file_in_it(tmp_path):
     (tmp_path / "effects.toml").write_text("")
     with pytest.raises(UserError, match="is one, such as effects"):
         load_effects(tmp_path)
+
+
+def test_a_value_far_beyond_what_is_usual_is_warned_of(tmp_path):
+    """A larger vehicle may have it, and a wrong unit, too."""
+    path = tmp_path / "effects.toml"
+    path.write_text("[rotor_drag]\nd_xy = 0.5\nd_z = 0.01\n[inertia]\nxx = 1.4\n")
+    (text,) = unusual_values(path)
+    assert "rotor_drag.d_xy = 0.5 N s/m is more than 3 times what is usual" in text

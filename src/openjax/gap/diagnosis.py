@@ -84,8 +84,8 @@ def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
     check = check_residual(evidence, selection.fit, selection.search.nothing.fit)
     theta = selection.fit.theta
     vehicle = evidence.vehicles[0]
-    old = trimmed_before(theta, selection.effects, evidence.baseline, vehicle, trims)
-    old |= forbidden(theta, selection.effects, vehicle)
+    of_days = trimmed_before(theta, selection.effects, evidence.baseline, vehicle, trims)
+    old = of_days | forbidden(theta, selection.effects, vehicle)
     if check.mostly_unknown:  # what acts is something else
         old |= set(selection.effects)
     candidates = [e for e, p in acting.items() if p >= 0.5 and e not in old]
@@ -101,7 +101,16 @@ def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
     sure = max((share.interval90[0] for share in parts.effects.values()), default=0.0)
     no_gap = parts.gap.probability_of_none
     chances = agreeing(chances, words(check, parts) or ("none",), sure, no_gap)
-    return _report(evidence, selection, check, parts, chances)
+    report = _report(evidence, selection, check, parts, chances)
+    text = ""
+    if trims is not None and of_days:
+        names = " and ".join(sorted(of_days)).replace("_", " ")
+        text = f" Trims differ as {names} would make them, and by no more than days do."
+    elif trims is None and report.reference and set(report.named) & set(OF_DAYS):
+        text = (
+            " Days alone move trims by 1 to 2.5 % of hover: a change that small may be the day's."
+        )
+    return replace(report, reference=report.reference + text)
 
 
 def forbidden(theta: np.ndarray, effects: Iterable[str], vehicle) -> set[str]:
@@ -232,9 +241,6 @@ def _reference_in_words(evidence: Evidence, effects) -> str:
         "The battery's charge may differ between the days, which changes what thrust a duty cycle "
         "makes: log vbat, and thrust can be compared."
     )
-    trims = "Days alone move trims by 1 to 2.5 % of hover: a change that small may be the day's."
-    if set(effects) & set(OF_DAYS):
-        text = f"{text} {trims}"
     return f"{text} {battery}" if evidence.charge_unknown else text
 
 

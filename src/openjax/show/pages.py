@@ -50,9 +50,8 @@ def small_figure(size: tuple[float, float]) -> tuple[Figure, Axes]:
 
 
 def add_legend(axes: Axes) -> None:
-    """Above the axes, where it covers nothing."""
-    place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.2}
-    axes.legend(ncols=2, fontsize=10, columnspacing=1.2, **place)
+    """Above the axes, over the figure's whole width, where it covers nothing."""
+    axes.figure.legend(loc="outside upper left", ncols=2, fontsize=10, columnspacing=1.2)
 
 
 def as_svg(figure: Figure, salt: str) -> str:

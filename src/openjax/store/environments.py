@@ -1,6 +1,8 @@
 """The game with what files add to it: a vehicle, physical effects, an evader."""
 
 import dataclasses
+import functools
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from openjax.pursuit.evaders import SCRIPTED, Evader, EvaderKind
 from openjax.store.own_code import is_own_code, own_code
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 from openjax.vehicle.effects import load_effects
+from openjax.vehicle.effects.effects_file import unusual_values
 from openjax.vehicle.family import vehicle_family
 from openjax.vehicle.parameters import AIRFRAMES
 from openjax.vehicle.vehicle_file import load_vehicle_file
@@ -69,6 +72,8 @@ def make_environment(
     elif opponent is not None:
         evaders = (find_opponent(opponent, settings),)
     names, parameters = load_effects(effects) if effects else ((), {})
+    for text in unusual_values(effects) if effects else ():
+        _warn(text)
     return Pursuit(
         with_airframe(settings, vehicle),
         vehicle=load_vehicle_file(vehicle).vehicle if vehicle else None,
@@ -76,6 +81,12 @@ def make_environment(
         effect_parameters=parameters,
         evaders=evaders,
     )
+
+
+@functools.cache
+def _warn(text: str) -> None:
+    """Say it once, however often a command makes its game."""
+    print(f"warning: {text}", file=sys.stderr)
 
 
 def is_evader_file(opponent: Any) -> bool:

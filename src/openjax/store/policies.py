@@ -32,6 +32,7 @@ from openjax.pursuit.evaders import SCRIPTED
 from openjax.store import DEFAULT_POLICY
 from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
+from openjax.store.leaves import named_leaves
 from openjax.store.own_code import is_own_code, own_code
 from openjax.store.policy_files import WEIGHTS, fill, load_policy_file, shipped_policies
 from openjax.store.run_directory import RunDirectory, is_run, open_run
@@ -313,6 +314,8 @@ def _build(settings, leaves, source):
         # Shipped without: flying needs no critic.
         abstract = abstract.replace(critic={})
     parameters = fill(abstract, leaves, source)
+    if unknown := sorted(set(leaves) - set(named_leaves(abstract))):
+        raise UserError(f"{source} holds {unknown[0]}, which the network of its settings lacks")
     return LoadedPolicy(policy, parameters, settings, source)
 
 

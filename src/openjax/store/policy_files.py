@@ -6,6 +6,7 @@ stored as float16 by default (half the size, about three decimal digits), other 
 stay as they are.
 """
 
+import hashlib
 import json
 import zipfile
 from pathlib import Path
@@ -52,6 +53,7 @@ def save_policy_file(
         array = np.asarray(leaf.astype(jnp.float32) if leaf.dtype == jnp.bfloat16 else leaf)
         header["dtypes"][name] = str(leaf.dtype)
         arrays[name] = array.astype(storage) if np.issubdtype(array.dtype, np.floating) else array
+    header["digest"] = _digest(arrays)
     arrays[_HEADER] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
     with replacing(path) as partial:
         np.savez_compressed(partial, **arrays)
@@ -71,6 +73,11 @@ def load_policy_file(
         header = json.loads(arrays.pop(_HEADER).tobytes())
         if not isinstance(header, dict) or header.get("format") != _FORMAT:
             raise UserError(f"{path} isn't of the format {_FORMAT!r}")
+        # older files have none
+        if header.get("digest", _digest(arrays)) != _digest(arrays):
+            raise UserError(
+                f"{path}: its arrays aren't those that {writer} wrote; take the file as it was"
+            )
         leaves = {
             name: array.astype(_dtype(header["dtypes"][name])) for name, array in arrays.items()
         }
@@ -94,6 +101,15 @@ def load_policy_file(
     if unequal:
         raise UserError(f"{path} holds numbers that aren't finite, in {unequal[0]}")
     return leaves, settings, notes
+
+
+def _digest(arrays: dict[str, np.ndarray]) -> str:
+    """SHA-256 of arrays with their names and shapes."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()
 
 
 def _read_arrays(path):

@@ -104,8 +104,13 @@ def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, st
     if alike or report.next_flight:
         reason = f"{''.join(alike)}{report.next_flight} Then diagnose all of them again."
         steps.append((reason, "openjax plan . --out next_flight"))
-    if report.parameters:
-        names = ", ".join(effect.replace("_", " ") for effect in report.parameters)
+    by_trims = report.change_by_trims
+    if by_trims is not None:
+        reason = f"Look whether {by_trims.causes_in_words()}, mend it, and fly again."
+        steps.append((reason, ""))
+    flown_with = [*report.parameters, *report.departures]
+    if flown_with:
+        names = ", ".join(effect.replace("_", " ") for effect in flown_with)
         tune = "openjax adapt effects.toml --policy flight"
         train = "openjax train --preset flight --effects effects.toml"
         steps.append((f"Fine-tune shipped weights to a vehicle with {names}:", tune))
@@ -116,7 +121,7 @@ def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, st
         )
         steps.append((reason, ""))
     case = _case_from(report, folder)
-    if report.verdict == "none":
+    if report.agrees:
         reason = "Nothing needs correcting. Keep these flights as the reference for later ones:"
         steps.append((reason, f"openjax diagnose NEW_FLIGHTS --reference {case}"))
     if "unknown" in report.effects:

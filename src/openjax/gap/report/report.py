@@ -171,6 +171,12 @@ class Report:
         return (does.quantities if does is not None else {}) | self.links
 
     @property
+    def agrees(self) -> bool:
+        """Whether nothing differs, by any measure."""
+        differs = self.departures or self.change_by_trims is not None
+        return self.verdict == "none" and not differs
+
+    @property
     def title(self) -> str:
         """The answer in a word."""
         if not self.named and self.change_by_trims is not None:

@@ -15,6 +15,8 @@ from openjax.gap.model.library import CARDS
 from openjax.gap.report.report import Report
 from openjax.show.pages import AFTER, BEFORE, STYLE, as_svg
 
+MATTERS = ("differs: a cause below", "differs: in effects.toml, no cause below")
+"""What is said of numbers that matter."""
 PANEL = (2.9, 4.0)  # inches, of one axis
 
 
@@ -33,13 +35,14 @@ def response_of(report: Report) -> dict | None:
             "effect": q.effect.replace("_", " "),
             "meaning": meaning_of(name, q, report),
             "differs": q.differs,
+            "matters": meaning_of(name, q, report) in MATTERS,
         }
         for name, q in report.numbers.items()
     ]
     return {
         "sentences": report.measured_in_words() or [does.sentence()],
         "remarks": does.remarks if does.trustworthy else does.remarks[1:],
-        "rows": sorted(rows, key=lambda row: not row["differs"]),
+        "rows": sorted(rows, key=lambda row: not row["matters"]),
         "pictures": pictures_of(does),
     }
 
@@ -49,11 +52,13 @@ def meaning_of(name: str, quantity: Quantity, report: Report) -> str:
     if not quantity.differs:
         return "as in the simulator"
     if quantity.effect in report.named or moves(name, report.named):
-        return "differs: a cause below"
+        return MATTERS[0]
     if not report.identification.trustworthy:
         return "differs, but is not trusted"
     if quantity.effect in report.departures:
-        return "differs: in effects.toml, no cause below"
+        return MATTERS[1]
+    if report.reference:
+        return "differs from the simulator"
     return "differs too little to matter"
 
 

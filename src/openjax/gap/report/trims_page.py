@@ -12,7 +12,7 @@ from openjax.gap.trims.change import Change, difference_in_words
 from openjax.gap.trims.figures import FIGURES, TRIMS
 from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, as_svg, fill_template, small_figure
 
-PANEL = (2.4, 3.0)  # inches
+PANEL = (2.6, 2.2)  # inches
 
 
 def content_of(change: Change, lines: list[str], answers: bool) -> dict:
@@ -24,11 +24,11 @@ def content_of(change: Change, lines: list[str], answers: bool) -> dict:
     with rc_context(STYLE):
         for name in TRIMS:
             figure, axes = small_figure(PANEL)
-            _draw_trim(axes, change, name, level)
+            draw_trim(axes, change, name, level)
             pictures.append((name, as_svg(figure, f"{change.name} {name}")))
         if answers:
             figure, axes = small_figure(PANEL)
-            _draw_places(axes, change)
+            draw_places(axes, change)
             pictures.append(("probability", as_svg(figure, change.name)))
     differences = [
         (FIGURES[name].words, difference_in_words(name, d)) for name, d in change.figures.items()
@@ -57,7 +57,7 @@ def _in_percent(flights, name, level):
     return 100 * (values / level - 1.0 if name == "hover" else values)
 
 
-def _draw_trim(axes: Axes, change: Change, name: str, level: float) -> None:
+def draw_trim(axes: Axes, change: Change, name: str, level: float) -> None:
     """A trim of every flight, day by day, on the band of normal days."""
     for k, figures in enumerate((change.reference, change.flights)):
         days = list(dict.fromkeys(f.day for f in figures))
@@ -74,7 +74,7 @@ def _draw_trim(axes: Axes, change: Change, name: str, level: float) -> None:
     axes.set(xticks=(0, 1), xticklabels=("reference", "new"), xlim=(-0.6, 1.6))
 
 
-def _draw_places(axes: Axes, change: Change) -> None:
+def draw_places(axes: Axes, change: Change) -> None:
     """How probable no change is, and each place of one."""
     places = sorted(change.places.items(), key=lambda item: -item[1])[:6]
     names = [

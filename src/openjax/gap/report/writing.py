@@ -45,8 +45,10 @@ def to_fly(report: Report) -> tuple[Values, Intervals]:
     values: Values = {}
     intervals: Intervals = {}
     for effect, estimates in report.parameters.items():
-        values[effect] = {name: estimate.value for name, estimate in estimates.items()}
-        intervals[effect] = {name: estimate.interval90 for name, estimate in estimates.items()}
+        # what is no size isn't flown with
+        sizes = {name: estimate for name, estimate in estimates.items() if estimate.is_size}
+        values[effect] = {name: estimate.value for name, estimate in sizes.items()}
+        intervals[effect] = {name: estimate.interval90 for name, estimate in sizes.items()}
     if report.identification is not None:
         # what was measured directly is more exact than what was fitted beside all else
         better, narrower = corrections(report.identification, report.named)

@@ -25,6 +25,8 @@ from openjax.vehicle.effects.registry import find_effect
 
 FAR = 100.0
 """Values may lie outside of a parameter's usual range by this many of its widths."""
+UNUSUAL = 3.0
+"""Times what is usual, from which on a value is worth a warning."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +65,22 @@ def load_intervals(path: str | Path) -> dict[str, dict[str, tuple[float, float]]
     return by_name
 
 
+def unusual_values(path: str | Path) -> list[str]:
+    """Values of an effects file that are several times as large as is usual, in words:
+    right for a larger vehicle than a Crazyflie, else probably a wrong unit.
+    """
+    return [
+        f"{path}: {name}.{key} = {entry.value:g} {parameter.unit} is more than "
+        f"{UNUSUAL:g} times what is usual, {low:g} to {high:g}"
+        for name, entries in _read(Path(path)).items()
+        for key, entry in entries.items()
+        for parameter in [find_effect(name, key).parameters[key]]
+        for low, high in [parameter.prior]
+        if abs(entry.value - parameter.none)
+        > UNUSUAL * max(abs(low - parameter.none), abs(high - parameter.none))
+    ]
+
+
 def _read(path: Path) -> dict[str, dict[str, _Entry]]:
     """The entries of an effects file."""
     table = read_toml(path, "effects file")
@@ -87,6 +105,13 @@ def _entry(path: Path, name: str, key: str, text) -> _Entry:
         raise UserError(
             f"{place}: interval90 is {list(entry.interval90)}; low must not exceed high"
         )
+    if entry.interval90 is not None:
+        low, high = entry.interval90
+        slack = 1e-5 * max(abs(low), abs(high))  # of numbers written with six digits
+        if not low - slack <= entry.value <= high + slack:
+            raise UserError(
+                f"{place} = {entry.value:g} lies outside its interval90, {low} to {high}"
+            )
     for number in (entry.value, *(entry.interval90 or ())):
         _check_number(parameter, number, place)
     return entry
