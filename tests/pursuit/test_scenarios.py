@@ -139,7 +139,7 @@ def test_own_layout(tmp_path):
         ),
         ("0.1, 0.7]", "0.1, 1.7]", "the evader starts at .* outside the arena"),
         ("evader = [-0.5, 0.1, 0.7]", "", "lacks evader"),
-        ('"two"', '"two\\nlines"', "isn't a line of printable characters"),
+        ('"two"', '"two\\nlines"', "isn't a line of up to"),
     ],
 )
 def test_what_is_wrong_with_a_layout_is_said_in_one_line(tmp_path, old, new, message):

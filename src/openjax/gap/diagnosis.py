@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
 
 import jax
@@ -102,15 +102,17 @@ def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
     no_gap = parts.gap.probability_of_none
     chances = agreeing(chances, words(check, parts) or ("none",), sure, no_gap)
     report = _report(evidence, selection, check, parts, chances)
-    text = ""
+    return replace(report, reference=report.reference + _days_in_words(report, of_days, trims))
+
+
+def _days_in_words(report: Report, of_days: Collection[str], trims: Change | None) -> str:
+    """What days have to do with the names, and with those of trims that aren't named."""
     if trims is not None and of_days:
         names = " and ".join(sorted(of_days)).replace("_", " ")
-        text = f" Trims differ as {names} would make them, and by no more than days do."
-    elif trims is None and report.reference and set(report.named) & set(OF_DAYS):
-        text = (
-            " Days alone move trims by 1 to 2.5 % of hover: a change that small may be the day's."
-        )
-    return replace(report, reference=report.reference + text)
+        return f" Trims differ as {names} would make them, and by no more than days do."
+    if trims is None and report.reference and set(report.named) & set(OF_DAYS):
+        return " Days alone move trims by 1 to 2.5 % of hover: so small a change may be the day's."
+    return ""
 
 
 def forbidden(theta: np.ndarray, effects: Iterable[str], vehicle) -> set[str]:

@@ -154,10 +154,9 @@ def _faults(layout: Scenario, settings: PursuitSettings) -> list[str]:
         faults.append(f"has {len(pursuers)} pursuers; 1 to 8 are possible")
     if len(pillars) > MOST_PILLARS:
         faults.append(f"has {len(pillars)} pillars; up to {MOST_PILLARS} are possible")
-    if len(layout.name) > LONGEST_NAME:
-        faults.append(f"its name is longer than {LONGEST_NAME} characters")
-    if not layout.name.isprintable() or not layout.name.strip():
-        faults.append(f"its name {layout.name!r} isn't a line of printable characters")
+    name = layout.name
+    if len(name) > LONGEST_NAME or not name.isprintable() or not name.strip():
+        faults.append(f"its name isn't a line of up to {LONGEST_NAME} printable characters")
     faults += [
         f"pillar {pillar} stands outside the arena of radius {radius} m"
         for pillar in pillars
