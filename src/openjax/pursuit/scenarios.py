@@ -136,6 +136,21 @@ def find_scenario(name_or_path: str, settings: PursuitSettings) -> Scenario:
     return scenario
 
 
+def _wrong_counts(layout: Scenario) -> list[str]:
+    """How many pursuers, pillars and characters of a name there are, where that can't
+    be.
+    """
+    faults = []
+    if not 1 <= len(layout.pursuers) <= 8:
+        faults.append(f"has {len(layout.pursuers)} pursuers; 1 to 8 are possible")
+    if len(layout.pillars) > MOST_PILLARS:
+        faults.append(f"has {len(layout.pillars)} pillars; up to {MOST_PILLARS} are possible")
+    name = layout.name
+    if len(name) > LONGEST_NAME or not name.isprintable() or not name.strip():
+        faults.append(f"its name isn't a line of up to {LONGEST_NAME} printable characters")
+    return faults
+
+
 def _faults(layout: Scenario, settings: PursuitSettings) -> list[str]:
     """The faults of a layout."""
     pursuers = layout.pursuers
@@ -149,14 +164,7 @@ def _faults(layout: Scenario, settings: PursuitSettings) -> list[str]:
     # where a drone would stand inside the pillar; a start that only breaches is a fair
     # task
     reach = settings.pillar_radius + DRONE_RADIUS
-    faults = []
-    if not 1 <= len(pursuers) <= 8:
-        faults.append(f"has {len(pursuers)} pursuers; 1 to 8 are possible")
-    if len(pillars) > MOST_PILLARS:
-        faults.append(f"has {len(pillars)} pillars; up to {MOST_PILLARS} are possible")
-    name = layout.name
-    if len(name) > LONGEST_NAME or not name.isprintable() or not name.strip():
-        faults.append(f"its name isn't a line of up to {LONGEST_NAME} printable characters")
+    faults = _wrong_counts(layout)
     faults += [
         f"pillar {pillar} stands outside the arena of radius {radius} m"
         for pillar in pillars
