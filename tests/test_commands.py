@@ -23,7 +23,7 @@ from openjax.evaluation.result_tables import FIELDS
 from openjax.learning import training_step
 from openjax.learning.training_step import make_phases
 from openjax.pursuit import SCENARIOS
-from openjax.runs import training
+from openjax.runs import programs
 from openjax.show.metrics import read_metrics
 from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
@@ -285,7 +285,7 @@ def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, t
 
         return step
 
-    monkeypatch.setattr(training, "make_device_step", make_broken_step)
+    monkeypatch.setattr(programs, "make_device_step", make_broken_step)
     out = tmp_path / "broken"
     options = [*train_arguments[1:], *ALONE, "--no-traced_programs", "--out", out]
     status, _ = in_process(train.main, options, monkeypatch, capsys)

@@ -3,7 +3,7 @@
 import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -27,19 +27,40 @@ def side_by_side(function: Callable, items: Iterable) -> list:
         return list(pool.map(function, items))
 
 
-def in_background(make: Callable[[], Any]) -> Callable[..., Any]:
-    """Start to make something in a thread of its own; a function that waits for it and
-    returns it, or raises its error.
+class Pending:
+    """Something that is being made in a thread of its own; called, it waits for it."""
 
-    Given seconds, it waits no longer and then raises `TimeoutError`.
+    def __init__(self, future: Future):
+        self._future = future
+
+    def __call__(self, seconds: float | None = None) -> Any:
+        """What was made. Raises its error, and `TimeoutError` where it isn't there after so
+        many seconds.
+        """
+        return self._future.result(seconds)
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether nobody would have to wait."""
+        return self._future.done()
+
+
+def in_background(make: Callable[[], Any]) -> Pending:
+    """Start to make something in a thread of its own."""
+    return one_by_one([make])[0]
+
+
+def one_by_one(makes: Iterable[Callable[[], Any]]) -> list[Pending]:
+    """Start to make several things, each after the one before it, in a thread of their
+    own.
     """
     pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="background")
-    future = pool.submit(make)
+    pending = [Pending(pool.submit(make)) for make in makes]
     pool.shutdown(wait=False)
-    return future.result
+    return pending
 
 
-def compile_ahead(function: Callable, *arguments) -> Callable[..., Any]:
+def compile_ahead(function: Callable, *arguments) -> Pending:
     """Start to compile a function of `jax.jit` for arguments of these shapes, dtypes
     and shardings.
 
@@ -52,7 +73,7 @@ def compile_ahead(function: Callable, *arguments) -> Callable[..., Any]:
       arguments: arrays, or `jax.ShapeDtypeStruct`s in their place.
 
     Returns:
-      a function that waits for the end, see `in_background`.
+      what waits for the compiler.
     """
     return in_background(function.lower(*arguments).compile)
 

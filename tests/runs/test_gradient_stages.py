@@ -6,8 +6,11 @@ import jax
 import numpy as np
 import pytest
 
-from openjax.learning import build, make_start, preset
-from openjax.runs.gradient_stages import TOGETHER, compile_first_flights, first_flights
+from openjax.cluster.processes import Processes
+from openjax.learning import make_start, preset
+from openjax.runs.gradient_stages import TOGETHER, compile_first_flights
+from openjax.runs.start import prepare
+from openjax.runs.train_command import TrainCommand
 
 SETTINGS = preset(
     "quick",
@@ -20,18 +23,16 @@ SETTINGS = preset(
 
 
 @pytest.mark.slow
-def test_the_first_flights_stop_when_asked_to():
-    environment = build(SETTINGS).environment
+def test_the_first_flights_stop_when_asked_to(tmp_path):
+    command = TrainCommand(
+        out=tmp_path / "run", devices="1", compare_with="none", settings=SETTINGS
+    )
+    job, _, _ = prepare(command, [], 0.0, Processes())
     fresh = make_start(SETTINGS)(jax.random.key(0)).policy
     said = []
     asked = iter([False, True])
-    _, learn = compile_first_flights(
-        first_flights(SETTINGS, environment),
-        jax.eval_shape(lambda: fresh),
-        said.append,
-        lambda: next(asked),
-    )
-    learnt = learn(fresh, jax.random.key(1))
+    program = compile_first_flights(job, jax.eval_shape(lambda: fresh))
+    learnt = program.learn(fresh, jax.random.key(1), said.append, lambda: next(asked))
     assert len(said) == 1 and said[0].startswith(f"{TOGETHER} of {2 * TOGETHER} updates, ")
     moved = [
         np.abs(np.asarray(new) - old).max()

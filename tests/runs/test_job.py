@@ -2,7 +2,6 @@
 
 import dataclasses
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +12,14 @@ from openjax.cluster.processes import Processes
 from openjax.files import read_json
 from openjax.learning import build, preset
 from openjax.pursuit import Pursuit
-from openjax.runs.last_stage import keep_best
+from openjax.runs.last_stage import BestPolicy, keep_best
+from openjax.runs.programs import kept_programs
+from openjax.runs.stages import awaits_validation
 from openjax.runs.start import other_compiler, prepare
 from openjax.runs.train_command import TrainCommand
-from openjax.runs.training import awaits_validation
 from openjax.store.checkpoints import CheckpointRecord
 from openjax.store.leaves import named_leaves
-from openjax.store.policy_files import load_policy_file, save_policy_file
+from openjax.store.policy_files import load_policy_file
 from openjax.store.run_directory import RunDirectory
 
 GOOD = {
@@ -54,10 +54,9 @@ def test_last_stage_keeps_what_validates_best_and_ends_when_asked(
     observation = jax.eval_shape(lambda key: environment.reset(key)[0], jax.random.key(0))
     observation = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), observation)
     parts = build(settings, environment)
-    job = SimpleNamespace(settings=settings, parts=parts)
     before = jax.jit(parts.policy.init)(jax.random.key(1), observation)
-    directory = RunDirectory(tmp_path)
-    save_policy_file(directory.policy, before, settings, {"update": 7}, storage="float32")
+    policy = BestPolicy(tmp_path / "policy.npz", before, settings, {"update": 7})
+    policy.save()
 
     def learn(parameters, key):
         for moved in np.arange(1, 11) / 5:
@@ -73,9 +72,9 @@ def test_last_stage_keeps_what_validates_best_and_ends_when_asked(
     def validate(parameters):
         return GOOD | {"crash_rate": next(rates)}
 
-    message = keep_best(directory, learn, validate, job, lambda: len(updates) >= asked_after)
+    message = keep_best(policy, learn, validate, lambda: len(updates) >= asked_after)
     assert len(updates) == min(asked_after, 10) and next(rates, None) is None
-    leaves, _, notes = load_policy_file(directory.policy)
+    leaves, _, notes = load_policy_file(policy.path)
     first = named_leaves(before)
     for name, leaf in leaves.items():
         np.testing.assert_allclose(leaf, first[name] + kept, atol=1e-6)
@@ -102,27 +101,52 @@ def test_a_run_that_another_jax_goes_on_with_says_so():
     assert f"JAX 0.9.1 so far; JAX {jax.__version__} goes on" in other_compiler(facts("0.9.1"))
 
 
-def test_a_start_that_was_never_validated_is_when_the_run_goes_on():
-    settings = preset("quick")
-    unscored = CheckpointRecord(Path("000000000"), 0, None, {})
-    assert awaits_validation(unscored, settings, None)
-    assert not awaits_validation(unscored, settings, "open")
-    assert not awaits_validation(unscored, preset("quick", first_flights=dict(updates=0)), None)
-    scored = CheckpointRecord(Path("000000000"), 0, 0.5, {})
-    later = CheckpointRecord(Path("000000007"), 7, None, {})
-    assert not any(awaits_validation(record, settings, None) for record in (scored, later))
+def job_of(settings, tmp_path, **options):
+    command = TrainCommand(
+        out=tmp_path / "run", devices="1", compare_with="none", settings=settings, **options
+    )
+    return prepare(command, [], 0.0, Processes())[0]
+
+
+def test_what_was_stopped_before_its_validation_is_validated_when_the_run_goes_on(tmp_path):
+    def record(update, score=None):
+        return CheckpointRecord(Path(f"{update:09d}"), update, score, {})
+
+    quick = job_of(preset("quick"), tmp_path)
+    assert awaits_validation(record(0), quick)
+    command = dataclasses.replace(quick.command, start_from="open")
+    assert not awaits_validation(record(0), dataclasses.replace(quick, command=command))
+    no_first_flights = preset("quick", first_flights=dict(updates=0))
+    assert not awaits_validation(record(0), job_of(no_first_flights, tmp_path))
+    # one is made every ten updates, and after the last one, the fiftieth
+    assert [update for update in (7, 10, 15, 50) if awaits_validation(record(update), quick)] == [
+        10,
+        50,
+    ]
+    assert not any(awaits_validation(record(update, 0.5), quick) for update in (0, 10, 50))
 
 
 def test_a_program_with_a_function_of_ones_own_is_never_recalled(tmp_path):
     """Its text may have changed since it was kept, under the same name in the same
     settings.
     """
-    settings = preset("quick")
-    command = TrainCommand(out=tmp_path / "run", devices="1", settings=settings)
-    job, _, _ = prepare(command, [], 0.0, Processes())
+    job = job_of(preset("quick"), tmp_path)
     kept = dataclasses.replace(job, traced=tmp_path)
-    assert kept.keep is not None
+    assert kept_programs(kept) is not None
     game = Pursuit(
-        settings.environment, evaders=(lambda scene, memory: (0.0 * memory[:3], memory),)
+        job.settings.environment, evaders=(lambda scene, memory: (0.0 * memory[:3], memory),)
     )
-    assert dataclasses.replace(kept, environment=game).keep is None
+    own = dataclasses.replace(kept.parts, environment=game)
+    assert kept_programs(dataclasses.replace(kept, parts=own)) is None
+
+
+def test_a_resumed_run_flies_as_many_episodes_of_layouts_as_it_was_asked_for(tmp_path):
+    first = job_of(preset("quick"), tmp_path, layout_episodes=3)
+    run = RunDirectory(tmp_path / "run")
+    run.path.mkdir()
+    run.write_settings(first.settings, first.facts)
+    command = TrainCommand(resume=run.path, settings=first.settings)
+    again, _, _ = prepare(command, [], 0.0, Processes())
+    assert again.command.layout_episodes == 3
+    again, _, _ = prepare(dataclasses.replace(command, layout_episodes=5), [], 0.0, Processes())
+    assert again.command.layout_episodes == 5

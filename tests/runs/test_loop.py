@@ -63,8 +63,23 @@ def compiled():
     return jax.jit(guarded(step), donate_argnums=0)
 
 
-def run(directory, compiled_step, updates, resume=False, evaluate=None, **plan):
-    checkpoints = Checkpoints(directory / "checkpoints")
+class Evaluation:
+    """A function of the carry as what evaluates it."""
+
+    def __init__(self, function, ready=True):
+        self.function = function
+        self.ready = ready
+
+    def __call__(self, carry):
+        return self.function(carry)
+
+    def is_ready(self):
+        return self.ready
+
+
+def run(directory, compiled_step, updates, resume=False, evaluate=None, **options):
+    checkpoints = options.pop("checkpoints", None) or Checkpoints(directory / "checkpoints")
+    ready = options.pop("ready", True)
     first = 0
     if resume:
         carry, record = checkpoints.restore_latest(abstract_like(place(init())))
@@ -72,7 +87,7 @@ def run(directory, compiled_step, updates, resume=False, evaluate=None, **plan):
     else:
         carry = place(init())
     metrics = MetricsWriter(directory, resumed_update=first if resume else None, tensorboard=False)
-    plan = Plan(total_updates=updates, steps_per_update=10, **{"validation_interval": 4, **plan})
+    plan = Plan(total_updates=updates, steps_per_update=10, **{"validation_interval": 4, **options})
     with Progress("toy", 10 * updates, Console(quiet=True)) as progress, StopRequest() as stop:
         try:
             loop = Loop(
@@ -83,7 +98,7 @@ def run(directory, compiled_step, updates, resume=False, evaluate=None, **plan):
                 progress=progress,
                 directory=directory,
                 stop=stop,
-                evaluate=evaluate(stop) if evaluate else None,
+                evaluate=Evaluation(evaluate(stop), ready) if evaluate else None,
                 first_update=first,
             )
             return loop.run(carry)
@@ -133,6 +148,47 @@ def test_a_start_that_was_stopped_before_its_validation_ships_the_same_policy(tm
     for name, array in states[0].items():
         np.testing.assert_array_equal(array, states[1][name], err_msg=name)
     assert parts.update == 8
+
+
+def test_updates_are_saved_before_anybody_waits_for_the_validations_compiler(tmp_path, compiled):
+    """A signal there ends the command at once; what was learnt goes on later, and is
+    validated first.
+    """
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+
+    def stopped(stop):
+        def look(carry):
+            raise KeyboardInterrupt
+
+        return look
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, compiled, 8, evaluate=stopped, ready=False, checkpoints=checkpoints)
+    checkpoints.abandon()
+    assert (checkpoints.latest().update, checkpoints.latest().score) == (4, None)
+
+    def score(stop):
+        return lambda carry: (-float(carry.update), {})
+
+    run(tmp_path, compiled, 8, resume=True, evaluate=score, validate_start=True)
+    assert Checkpoints(tmp_path / "checkpoints").best().update == 4
+
+
+def test_a_run_that_goes_on_keeps_its_validations_once(tmp_path):
+    def validations():
+        return [r["update"] for r in read_metrics(tmp_path / "metrics.jsonl", "validation")]
+
+    def write(*updates, **options):
+        writer = MetricsWriter(tmp_path, **options, tensorboard=False)
+        for update in updates:
+            writer.write("validation", update, 0, 0.0, {})
+        writer.close()
+
+    write(0, 4)
+    write(resumed_update=0)
+    assert validations() == [0]
+    write(0, 4, resumed_update=0, drop_validation=True)
+    assert validations() == [0, 4]
 
 
 def test_best_and_last_checkpoints_are_kept(tmp_path, compiled):

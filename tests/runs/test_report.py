@@ -7,7 +7,7 @@ import pytest
 
 import openjax
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
-from openjax.runs.other_policy import compare, game_for
+from openjax.runs.other_policy import game_for, other_policy
 
 
 @pytest.mark.slow
@@ -22,7 +22,7 @@ def test_it_plays_the_runs_game_and_steers_as_it_was_trained_to():
         start_attitude="level",
     )
     policy = openjax.load_policy("apf")
-    rows, flights = compare(policy, Pursuit(run), [SCENARIOS["empty"]], 1, 2)
+    rows, flights = other_policy("apf", Pursuit(run)).fly([SCENARIOS["empty"]], 1, 2)
     assert [(row["scenario"], row["episodes"]) for row in rows] == [("validation", 2), ("empty", 1)]
     flight = flights[1]
     assert (

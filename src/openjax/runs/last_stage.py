@@ -2,19 +2,19 @@
 worse.
 """
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import jax
 
 from openjax.evaluation.validation import selection_score
 from openjax.files import write_json
+from openjax.learning import TrainSettings
 from openjax.policy import PolicyParameters
-from openjax.runs.job import TrainingJob
 from openjax.store.leaves import place
-from openjax.store.policies import abstract_parameters
-from openjax.store.policy_files import fill, load_policy_file, save_policy_file
-from openjax.store.run_directory import RunDirectory
+from openjax.store.policy_files import save_policy_file
 
 TOLERANCE = 0.03
 """What a stage against evaders that plan may lose on the validation's scripted ones and
@@ -23,40 +23,49 @@ distances in a third of a hundredth more of the steps, which is half of this.
 """
 
 
+@dataclasses.dataclass(frozen=True)
+class BestPolicy:
+    """The best policy of a run so far, as it is written."""
+
+    path: Path
+    parameters: PolicyParameters
+    settings: TrainSettings
+    notes: dict
+
+    def save(self) -> None:
+        """Write it, in place of what is there."""
+        save_policy_file(self.path, self.parameters, self.settings, self.notes, storage="float32")
+
+
 def keep_best(
-    directory: RunDirectory,
+    policy: BestPolicy,
     learn: Callable[[PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict]]],
     validate: Callable[[PolicyParameters], dict],
-    job: TrainingJob,
     over: Callable[[], bool],
 ) -> str:
-    """Take a run's policy through the last stage, and keep the best of what it becomes
-    and what it was.
+    """Take a run's policy through the last stage; the best of what it becomes and what it
+    was is written.
 
     Args:
-      directory: the run's; `policy.npz` is what the stage starts from, and what it
-      writes.
+      policy: what the stage starts from.
       learn: (parameters, key) -> after each update the parameters and its metrics.
       validate: parameters -> summary of validation tasks by which no checkpoint was
       chosen.
-      job: the run's; its settings and parts are looked at.
       over: is asked after each update whether to stop.
 
     Returns:
       what to tell of it.
     """
     began = time.monotonic()
-    settings = job.settings
-    earlier, _, notes = load_policy_file(directory.policy)
-    abstract = abstract_parameters(job.parts.environment, job.parts.policy)
+    settings = policy.settings
     # where the validation, too, was compiled for
-    earlier = place(fill(abstract, earlier, str(directory.policy)))
+    start = place(policy.parameters)
     length = settings.environment.episode_length
-    looks = [{"update": 0, **validate(earlier)}]
+    looks = [{"update": 0, **validate(start)}]
     history = []
     best = 0
     scores = [selection_score(looks[0], length)]
-    for parameters, parts in learn(earlier, jax.random.key(settings.seed)):
+    for parameters, parts in learn(start, jax.random.key(settings.seed)):
         history.append(parts)
         if over():
             break
@@ -66,17 +75,17 @@ def keep_best(
         scores.append(selection_score(looks[-1], length))
         if _is_better(settings, scores, best):
             best = len(looks) - 1
-            better = {"far_validation_score": scores[best], "analytic_updates": len(history)}
+            notes = {"far_validation_score": scores[best], "analytic_updates": len(history)}
+            notes = {**policy.notes, **notes}
             # at once: a stage that is ended early leaves the best of what it was
-            save_policy_file(
-                directory.policy, parameters, settings, {**notes, **better}, storage="float32"
-            )
+            dataclasses.replace(policy, parameters=parameters, notes=notes).save()
     facts = {
         "seconds": round(time.monotonic() - began, 1),
         "kept": looks[best]["update"],
         "validation_scores": scores,
     }
-    write_json(directory.path / "analytic.json", {**facts, "validation": looks, "history": history})
+    report = policy.path.with_name("analytic.json")
+    write_json(report, {**facts, "validation": looks, "history": history})
     return _in_words(facts, len(history), scores[best])
 
 

@@ -8,7 +8,7 @@ import dataclasses
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -25,10 +25,17 @@ from openjax.store.leaves import named_leaves
 NOT_FINITE = "not_finite"
 
 
-class NotFiniteError(Exception):
-    """A NaN appeared; the message is one line that says where and what is left to look
-    at.
-    """
+class Stopped(Exception):
+    """A run ended before its report; the message is one line that says why."""
+
+    status = 0
+    """Of the command."""
+
+
+class NotFiniteError(Stopped):
+    """A NaN appeared; the message says where and what is left to look at."""
+
+    status = 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,10 +50,10 @@ class Plan:
     checkpoint_seconds: float = 60.0
     """Longest time without a checkpoint."""
     time_limit: float = float("inf")
-    """Seconds of training time (compilation included) after which to stop."""
+    """Seconds from the loop's begin after which to stop."""
     validate_start: bool = False
-    """Validate before the first update, too: what a run starts from may be the best
-    there will be.
+    """Validate before the next update, too: what a run starts from may be the best there
+    will be, and one may have been stopped between a checkpoint and its validation.
     """
     overlap: bool | None = None
     """Start an update before the last one's metrics are read: an accelerator then never
@@ -104,6 +111,18 @@ def float_leaves(carry: Any) -> dict[str, jax.Array]:
     }
 
 
+class Evaluate(Protocol):
+    """Says how good a carry is."""
+
+    def __call__(self, carry: Any) -> tuple[float, dict[str, float]]:
+        """Score and metrics on the validation tasks; must not touch the carry."""
+
+    def is_ready(self) -> bool:
+        """Whether it would begin at once. Where it waits for the compiler, a signal ends the
+        command.
+        """
+
+
 @dataclasses.dataclass
 class Loop:
     """Training until the plan is done, a time limit, a signal or a NaN.
@@ -122,14 +141,17 @@ class Loop:
     directory: Path
     """The run's; the state with a NaN is left in `not_finite` there."""
     stop: StopRequest
-    evaluate: Callable[[Any], tuple[float, dict[str, float]]] | None = None
-    """carry -> (score, metrics) on the validation tasks; must not touch the carry."""
+    evaluate: Evaluate | None = None
     first_update: int = 0
     """Updates done before (a resumed run) ..."""
     seconds: float = 0.0
     """... and the training time that they took."""
     everyone: Callable[[Any], list] = lambda value: [value]
     """Gathers a value of each process, as `Processes.everyone` does."""
+    began: float = dataclasses.field(default_factory=time.monotonic, init=False)
+    saved_at: float = dataclasses.field(default_factory=time.monotonic, init=False)
+    """When the last checkpoint was written."""
+    best_score: float = dataclasses.field(default=-float("inf"), init=False)
 
     def run(self, carry: Any) -> Outcome:
         """Train; the carry's leaves are donated.
@@ -140,13 +162,13 @@ class Loop:
         plan = self.plan
         update = self.first_update
         pending = None
-        self._started = self._saved_at = time.monotonic()
         best = self.checkpoints.best()
-        self._best_score = best.score if best else -float("inf")
+        if best is not None:
+            self.best_score = best.score
         overlap = jax.devices()[0].platform != "cpu" if plan.overlap is None else plan.overlap
         reason, _ = self._decide()
-        if plan.validate_start and self.evaluate is not None and update == 0 and reason is None:
-            self._save(0, carry, validate=True)
+        if plan.validate_start and self.evaluate is not None and reason is None:
+            self._save(update, carry, validate=True)
         if reason is None:
             self.progress.phase("compiling the training step", announce=False)
         while update < plan.total_updates and reason is None:
@@ -171,7 +193,7 @@ class Loop:
         return Outcome(carry, update, self._seconds(), stopped_by)
 
     def _seconds(self):
-        return self.seconds + time.monotonic() - self._started
+        return self.seconds + time.monotonic() - self.began
 
     def _log(self, event, update, values):
         if self.metrics is not None:
@@ -198,9 +220,9 @@ class Loop:
         """Why to stop, and whether a checkpoint is late: a signal to any process
         counts, and the first one's clock.
         """
-        checkpoint_due = time.monotonic() - self._saved_at > self.plan.checkpoint_seconds
+        checkpoint_due = time.monotonic() - self.saved_at > self.plan.checkpoint_seconds
         decision = self.everyone(
-            [self.stop.name, self._seconds() >= self.plan.time_limit, checkpoint_due]
+            [self.stop.name, time.monotonic() - self.began >= self.plan.time_limit, checkpoint_due]
         )
         signals = [name for name, _, _ in decision if name is not None]
         # hosts' clocks differ, and all must decide alike
@@ -214,13 +236,15 @@ class Loop:
         """
         score = None
         if validate and self.evaluate is not None:
+            if not self.evaluate.is_ready():
+                self.checkpoints.save(update, carry, None, {"seconds": self._seconds()})
             self.progress.phase("evaluating on validation tasks", announce=False)
             score, validation = self.evaluate(carry)
             self._log("validation", update, validation)
-            self.progress.validation(validation, is_best=score >= self._best_score)
-            self._best_score = max(score, self._best_score)
+            self.progress.validation(validation, is_best=score >= self.best_score)
+            self.best_score = max(score, self.best_score)
         self.checkpoints.save(update, carry, score, {"seconds": self._seconds()})
-        self._saved_at = time.monotonic()
+        self.saved_at = time.monotonic()
 
     def _leave_broken_state(self, carry, update_reached, update, leaves, values):
         """Save what there is to look at; the error that says where."""
@@ -246,4 +270,6 @@ class Loop:
         names = ", ".join(leaves[:3])
         if len(leaves) > 3:
             names += f" and {len(leaves) - 3} more"
-        return NotFiniteError(f"NaN in update {update} in {names}; the state is in {place}, {good}")
+        return NotFiniteError(
+            f"stopped: NaN in update {update} in {names}; the state is in {place}, {good}"
+        )

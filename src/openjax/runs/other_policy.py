@@ -9,9 +9,9 @@ import jax
 
 from openjax.evaluation.evaluator import Evaluator, layout_slots, layout_tasks
 from openjax.evaluation.validation import uniform_tasks
-from openjax.pursuit import Pursuit, Scenario
+from openjax.pursuit import Pursuit, PursuitSettings, Scenario
 from openjax.show.trajectory import Trajectory
-from openjax.store.policies import LoadedPolicy
+from openjax.store.policies import LoadedPolicy, load_policy
 
 
 def game_for(environment: Pursuit, policy: LoadedPolicy) -> Pursuit:
@@ -31,39 +31,44 @@ def game_for(environment: Pursuit, policy: LoadedPolicy) -> Pursuit:
     return dataclasses.replace(environment, settings=settings, dynamics=None, observer=None)
 
 
-def compare(
-    policy: LoadedPolicy,
-    environment: Pursuit,
-    scenarios: Sequence[Scenario],
-    episodes: int,
-    validation: int,
-) -> tuple[list[dict], list[Trajectory]]:
-    """Fly a policy in the game of a run: `validation` of the uniform validation tasks,
-    and layouts.
+@dataclasses.dataclass(frozen=True)
+class OtherPolicy:
+    """A policy in the game of a run, see `other_policy`."""
 
-    Args:
-      policy: another one than the run's.
-      environment: the run's.
-      scenarios: the layouts.
-      episodes: of each layout.
-      validation: number of tasks.
+    policy: LoadedPolicy
+    environment: Pursuit
+    """The game as this policy sees it and steers in it."""
+    run: PursuitSettings
+    """Of the run's own game."""
 
-    Returns:
-      records as of `Flown.record`, that of the validation tasks first, their capture
-      steps in steps of the run; and the first episode of each.
+    def fly(
+        self, scenarios: Sequence[Scenario], episodes: int, validation: int
+    ) -> tuple[list[dict], list[Trajectory]]:
+        """Fly `validation` of the run's uniform validation tasks, and `episodes` of each
+        layout.
 
-    Raises:
-      UserError: the policy can't play this game.
+        Returns:
+          records as of `Flown.record`, that of the validation tasks first, their capture
+          steps in steps of the run; and the first episode of each.
+        """
+        settings = self.environment.settings
+        tasks = {"validation": uniform_tasks(self.run, validation, settings.max_pillars)}
+        tasks |= layout_tasks(settings, scenarios, episodes)
+        # all in one batch, which is flown once
+        number = validation + episodes * len(scenarios)
+        evaluator = Evaluator(self.environment, self.policy.policy, number)
+        kinds = evaluator.fly(self.policy.parameters, tasks, jax.random.key(0))
+        rows = [kind.record() for kind in kinds]
+        for row in rows:
+            row["capture_step"] *= settings.time_step / self.run.time_step
+        titles = [f"{kind.name}, {self.policy.source}" for kind in kinds]
+        return rows, [kind.trajectory(0, title) for kind, title in zip(kinds, titles, strict=True)]
+
+
+def other_policy(name: str, environment: Pursuit) -> OtherPolicy:
+    """The policy of that name in the game of a run. Raises UserError where it can't play
+    it.
     """
+    policy = load_policy(name)
     game = game_for(environment, policy)
-    settings = game.settings
-    policy = policy.in_game(game)
-    tasks = {"validation": uniform_tasks(environment.settings, validation, settings.max_pillars)}
-    tasks |= layout_tasks(settings, scenarios, episodes)
-    # all in one batch, which is flown once
-    evaluator = Evaluator(game, policy.policy, validation + episodes * len(scenarios))
-    kinds = evaluator.fly(policy.parameters, tasks, jax.random.key(0))
-    rows = [kind.record() for kind in kinds]
-    for row in rows:
-        row["capture_step"] *= settings.time_step / environment.settings.time_step
-    return rows, [kind.trajectory(0, f"{kind.name}, {policy.source}") for kind in kinds]
+    return OtherPolicy(policy.in_game(game), game, environment.settings)

@@ -13,12 +13,10 @@ from openjax.evaluation.validation import Validation
 from openjax.files import write_json
 from openjax.runs.job import TrainingJob
 from openjax.runs.loop import Outcome
-from openjax.runs.other_policy import compare
 from openjax.runs.words import layouts_like
 from openjax.show.metrics import METRICS_FILE
 from openjax.show.number_tables import numbers_table
 from openjax.show.progress import Progress
-from openjax.store.policies import load_policy
 from openjax.store.policy_files import fill, load_policy_file
 from openjax.store.run_directory import RunDirectory
 
@@ -42,14 +40,14 @@ def report(
     for moment, path in (("before", directory.start_policy), ("after", directory.policy)):
         progress.phase(f"evaluating the policy {moment} training on the layouts")
         parameters = fill(abstract, load_policy_file(path)[0], str(path))
-        kinds, pictures = _fly(validation, parameters, layouts, job.layout_episodes)
+        kinds, pictures = _fly(validation, parameters, layouts, job.command.layout_episodes)
         rows[moment] = [kind.record(_BESIDE_RECORD) for kind in kinds]
     # of the trained policy, which comes last
     flights = [kind.trajectory(episode, title) for kind, episode, title in pictures]
     other_rows, other_flights = _compare(job, layouts, validation.number, progress)
     progress.phase("drawing")
     facts = {
-        **({job.compare_with: other_rows} if other_rows else {}),
+        **({job.command.compare_with: other_rows} if other_rows else {}),
         "updates": outcome.update,
         "steps": outcome.update * settings.steps_per_update,
         "seconds": round(outcome.seconds, 1),
@@ -59,7 +57,11 @@ def report(
     _draw(directory, flights, other_flights)
     progress.phase("done", announce=False)
     return before_after_table(
-        rows["before"], rows["after"], settings.environment.time_step, job.compare_with, other_rows
+        rows["before"],
+        rows["after"],
+        settings.environment.time_step,
+        job.command.compare_with,
+        other_rows,
     )
 
 
@@ -67,17 +69,11 @@ def _compare(job, layouts, validation, progress):
     """Records and flights of the policy beside which the run's is shown; none without
     one.
     """
-    if job.compare_with is None:
+    if job.other is None:
         return [], []
-    progress.phase(f"evaluating {job.compare_with} in the same game")
+    progress.phase(f"evaluating {job.command.compare_with} in the same game")
     # its networks may be large, and these are minutes on a small machine
-    return compare(
-        load_policy(job.compare_with),
-        job.environment,
-        layouts,
-        episodes=min(job.layout_episodes, 8),
-        validation=min(validation, 32),
-    )
+    return job.other.fly(layouts, min(job.command.layout_episodes, 8), min(validation, 32))
 
 
 def _fly(validation, parameters, layouts, episodes):

@@ -17,9 +17,11 @@ from openjax.cluster.processes import Processes
 from openjax.command_line import output_console, parse, peek
 from openjax.errors import UserError
 from openjax.files import remove_unfinished, to_plain
-from openjax.learning import TrainSettings, preset
-from openjax.runs.job import ALL_SHIPPED, OwnParts, TrainingJob
+from openjax.learning import TrainSettings, build, preset
+from openjax.ranges import check_intervals
+from openjax.runs.job import ALL_SHIPPED, OwnParts, TrainingJob, check_job, start_parameters
 from openjax.runs.machine import describe_machine
+from openjax.runs.other_policy import other_policy
 from openjax.runs.train_command import MAY_CHANGE, PROGRAM, TrainCommand
 from openjax.runs.training import run_job
 from openjax.runs.words import different_settings, opening_words
@@ -92,7 +94,7 @@ def start(
     arguments: Sequence[str],
     start_time: float,
     processes: Processes,
-    parts: OwnParts = ALL_SHIPPED,
+    own: OwnParts = ALL_SHIPPED,
 ) -> int:
     """Make the run's directory, or open it, and train. Returns the exit status.
 
@@ -101,10 +103,10 @@ def start(
       arguments: the command line, for the run's facts.
       start_time: `time.monotonic()` when the command started.
       processes: that train together.
-      parts: those handed in from Python.
+      own: parts that were handed in from Python.
     """
     cache = cache_programs() if command.compilation_cache else None
-    job, directory, files = prepare(command, arguments, start_time, processes, parts)
+    job, directory, files = prepare(command, arguments, start_time, processes, own)
     if command.traced_programs and cache is not None:
         job = dataclasses.replace(job, traced=cache / "traced")
     # a mistake shows before any process changes a file
@@ -137,7 +139,7 @@ def prepare(
     arguments: Sequence[str],
     start_time: float,
     processes: Processes,
-    parts: OwnParts = ALL_SHIPPED,
+    own: OwnParts = ALL_SHIPPED,
 ) -> tuple[TrainingJob, RunDirectory, dict[str, Path]]:
     """What to train, where, and the files to copy there, by their names; nothing is
     changed yet. Arguments as of `start`.
@@ -148,35 +150,57 @@ def prepare(
     old_run = None if command.resume is None else open_run(command.resume)
     stored_facts = {} if old_run is None else old_run.read_facts()
     files = _files(command, old_run)
-    _check_parts(parts, files, stored_facts)
-    environment = parts.environment or _environment(command.settings.environment, files)
-    settings = dataclasses.replace(command.settings, environment=environment.settings)
+    _check_parts(own, files, stored_facts)
+    environment = own.environment or _environment(command.settings.environment, files)
+    command = _complete(command, environment, stored_facts)
     directory = old_run or RunDirectory(_free_directory(command, processes))
-    started_from = _lasting(command.start_from) or stored_facts.get("start_from")
-    facts = {
-        **({"own_parts": parts.names} if parts.names else {}),
+    parts = build(command.settings, environment, own.policy, own.learners)
+    # needed again only where a run was killed before its first checkpoint
+    starts_from = None if _has_begun(old_run) else command.start_from
+    job = TrainingJob(
+        command=command,
+        parts=parts,
+        own=own,
+        devices=int(command.devices),
+        processes=processes,
+        start=starts_from and start_parameters(starts_from, command.settings, parts),
+        other=command.compare_with and other_policy(command.compare_with, environment),
+        facts=_facts(command, arguments, own),
+        began=start_time,
+    )
+    check_job(job)
+    return (job, directory, {name: path for name, path in files.items() if path is not None})
+
+
+def _complete(command, environment, stored_facts):
+    """The command with what is settled by its game, by the machine, or by the run that is
+    resumed, whose facts these are.
+    """
+    settings = dataclasses.replace(command.settings, environment=environment.settings)
+    episodes = command.layout_episodes or stored_facts.get("layout_episodes")
+    complete = dataclasses.replace(
+        command,
+        settings=settings,
+        devices=str(_devices(command.devices, settings, stored_facts.get("devices"))),
+        start_from=_lasting(command.start_from) or stored_facts.get("start_from"),
+        layout_episodes=episodes or _layout_episodes(environment),
+        compare_with=_comparison(command, stored_facts),
+    )
+    check_intervals(complete, "--")
+    return complete
+
+
+def _facts(command, arguments, own):
+    """What is kept beside the settings, so that a resumed run goes on with it."""
+    return {
+        **({"own_parts": own.names} if own.names else {}),
         "command": " ".join([PROGRAM, *arguments]),
         "machine": describe_machine(),
-        "devices": _devices(command.devices, settings, stored_facts.get("devices")),
-        "start_from": started_from,
-        "compare_with": _comparison(command, stored_facts),
+        "devices": int(command.devices),
+        "start_from": command.start_from,
+        "compare_with": command.compare_with,
+        "layout_episodes": command.layout_episodes,
     }
-    job = TrainingJob(
-        settings=settings,
-        environment=environment,
-        # needed again only where a run was killed before its first checkpoint
-        start_from=None if _has_begun(old_run) else started_from,
-        devices=facts["devices"],
-        processes=processes,
-        time_limit=float("inf") if command.minutes is None else 60.0 * command.minutes,
-        layout_episodes=command.layout_episodes or _layout_episodes(environment),
-        compare_with=facts["compare_with"],
-        facts=facts,
-        started=start_time,
-        own=parts,
-    )
-    job.check()
-    return (job, directory, {name: path for name, path in files.items() if path is not None})
 
 
 def _has_begun(run):

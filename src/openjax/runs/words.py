@@ -11,6 +11,8 @@ from openjax.files import to_plain
 from openjax.learning import TrainSettings
 from openjax.learning.presets import PRESETS
 from openjax.pursuit import SCENARIOS, PursuitSettings, Scenario
+from openjax.store.checkpoints import Checkpoints
+from openjax.store.run_directory import RunDirectory
 
 NAMED = 3
 """Most changed settings that are named."""
@@ -81,6 +83,21 @@ def closing_words(
     steps.append(f"{as_typed('openjax sample_flights flights')}, then")
     steps.append(as_typed("openjax diagnose flights (from flight logs to a cause)"))
     return [*lines, "\n  ".join(["Next:", *steps])]
+
+
+def how_to_go_on(checkpoints: Checkpoints, directory: RunDirectory) -> str:
+    """What there is of a run, and how it goes on, should it end now."""
+    update = checkpoints.last_finished()
+    saved = "nothing was learnt yet" if update is None else f"saved at update {update}"
+    return f"{saved}; go on with {as_typed(f'openjax train --resume {directory.path}')}"
+
+
+def first_flights_words(summary: dict) -> str:
+    """What the stage before MAPPO taught, by its validation."""
+    return (
+        f"the first flights alone catch {summary['capture_rate']:.0%} of the validation tasks and "
+        f"crash in {summary['crash_rate']:.0%}; MAPPO goes on from there"
+    )
 
 
 def _pillars(game):

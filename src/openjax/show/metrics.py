@@ -23,6 +23,7 @@ class MetricsWriter:
       starts afresh.
       resumed_steps: environment steps done at `resumed_update`, where TensorBoard's
       curves go on.
+      drop_validation: whether the validation of `resumed_update` comes again, too.
       tensorboard: False leaves the event files out.
     """
 
@@ -31,6 +32,7 @@ class MetricsWriter:
         directory: Path,
         resumed_update: int | None = None,
         resumed_steps: int = 0,
+        drop_validation: bool = False,
         tensorboard: bool = True,
     ):
         directory = Path(directory)
@@ -40,7 +42,7 @@ class MetricsWriter:
             path.unlink(missing_ok=True)
             shutil.rmtree(directory / "tensorboard", ignore_errors=True)
         else:
-            truncate_metrics(path, resumed_update)
+            truncate_metrics(path, resumed_update, drop_validation)
         self._file = open(path, "ab", buffering=0)
         self._events = None
         if tensorboard:
@@ -103,12 +105,19 @@ def read_metrics(path: Path, event: str | None = None) -> Iterator[dict]:
                 yield record
 
 
-def truncate_metrics(path: Path, update: int) -> None:
-    """Drop records of updates after `update` and a half-written last line."""
+def truncate_metrics(path: Path, update: int, drop_validation: bool = False) -> None:
+    """Drop records of updates after `update`, a half-written last line and, if
+    `drop_validation`, the validation of `update`.
+    """
     path = Path(path)
     if not path.exists():
         return
+
+    def comes_again(record):
+        is_dropped = drop_validation and record["event"] == "validation"
+        return record["update"] > update or (is_dropped and record["update"] == update)
+
     with replacing(path) as partial, open(partial, "w", encoding="utf-8") as file:
         for record in read_metrics(path):
-            if record["update"] <= update:
+            if not comes_again(record):
                 file.write(json.dumps(record) + "\n")
