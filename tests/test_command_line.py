@@ -40,6 +40,13 @@ def test_mistyped_command():
         main(["trian"])
 
 
+@pytest.mark.parametrize("value", ["1", "True"])
+def test_64_bits_are_refused_in_one_line(value, monkeypatch):
+    monkeypatch.setenv("JAX_ENABLE_X64", value)
+    with pytest.raises(UserError, match="JAX_ENABLE_X64 is set; openjax computes in 32 bits"):
+        main(["train"])
+
+
 def test_version(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"openjax {openjax.__version__}\n"

@@ -287,7 +287,7 @@ def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, t
 
     monkeypatch.setattr(programs, "make_device_step", make_broken_step)
     out = tmp_path / "broken"
-    options = [*train_arguments[1:], *ALONE, "--no-traced_programs", "--out", out]
+    options = [*train_arguments[1:], *ALONE, "--no-compilation_cache", "--out", out]
     status, _ = in_process(train.main, options, monkeypatch, capsys)
     assert status == 1
     report = json.loads((out / "not_finite" / "report.json").read_text())

@@ -1,6 +1,7 @@
 """Every command of the package: `openjax NAME ...`, or `python -m openjax NAME ...`."""
 
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 
@@ -57,6 +58,9 @@ def main(arguments: Sequence[str]) -> int | None:
     command = name.replace("-", "_")
     if command not in COMMANDS:
         raise UserError(f"{name}: no such command; {suggestion(command, COMMANDS)}")
+    # as JAX reads it, which needn't be loaded for that
+    if os.environ.get("JAX_ENABLE_X64", "").lower() in ("1", "t", "true", "y", "yes", "on"):
+        raise UserError("JAX_ENABLE_X64 is set; openjax computes in 32 bits: unset it")
     return importlib.import_module(f"openjax.commands.{command}").main(arguments[1:])
 
 

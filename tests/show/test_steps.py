@@ -34,6 +34,28 @@ def test_nothing_but_text_goes_into_files():
     assert duration(65.2) == "1:05"
 
 
+def test_a_file_is_told_how_far_a_long_step_is():
+    """Minutes without a word look like a program that hangs."""
+    output = io.StringIO()
+    durations = {"compiling": 80.0, "learning": 240.0, "writing": 1.0}
+    with Steps("adapting open", durations, Console(file=output)) as steps:
+        for step, note in [
+            ("compiling", ""),
+            ("learning", "0 of 120 updates"),
+            ("learning", "40 of 120 updates"),
+            ("learning", "40 of 120 updates"),
+            ("writing", ""),
+        ]:
+            steps.begin(step, note)
+    first, *lines = output.getvalue().splitlines()
+    assert first == "adapting open: about 5:21 ..."
+    assert [line.partition(", about")[0] for line in lines] == [
+        "adapting open: compiling",
+        "adapting open: learning (0 of 120 updates)",
+        "adapting open: learning (40 of 120 updates)",
+    ]
+
+
 def test_mistyped_setting():
     with pytest.raises(UserError, match=r"num_pursuer: .* did you mean num_pursuers\?"):
         openjax.make(num_pursuer=3)

@@ -84,9 +84,11 @@ def test_metrics_survive_a_kill_and_are_cut_to_the_resumed_update(tmp_path):
     with open(tmp_path / "metrics.jsonl", "ab") as file:
         file.write(b'{"event": "train", "upd')
     assert [r["loss"] for r in read_metrics(tmp_path / "metrics.jsonl")] == [1, None, 3, 4, 5]
-    MetricsWriter(tmp_path, resumed_update=3, tensorboard=False).write(
+    told = []
+    MetricsWriter(tmp_path, resumed_update=3, tensorboard=False, on_record=told.append).write(
         "train", 4, 40, 0.1, {"loss": 40}
     )
+    assert told == [{"event": "train", "update": 4, "steps": 40, "seconds": 0.1, "loss": 40}]
     assert [r["loss"] for r in read_metrics(tmp_path / "metrics.jsonl")] == [1, None, 3, 40]
 
 

@@ -4,6 +4,8 @@ fine-tuning, figures of both policies.
 
 import contextlib
 import dataclasses
+import functools
+import itertools
 import os
 import shutil
 import subprocess
@@ -61,24 +63,28 @@ def check(command: AdaptCommand) -> None:
     (load_case if command.flights.is_dir() else load_effects)(command.flights)
 
 
-def adapt(command: AdaptCommand, tell: Callable[[str], None] = lambda step: None) -> dict:
-    """Do all of it and write it down; `tell` hears the steps. Raises UserError for
-    flights that can't be diagnosed or an unusable policy.
+def adapt(
+    command: AdaptCommand, tell: Callable[[str, str], None] = lambda step, note: None
+) -> dict:
+    """Do all of it and write it down; `tell` is told each step, and how far it is. Raises
+    UserError for flights that can't be diagnosed or an unusable policy.
     """
     start = time.monotonic()
     seconds = {}
     steps = iter(STEPS)
-    tell(next(steps))
+    tell(next(steps), "")
     with _diagnosis(command) as effects:
         programs = _Programs(command)  # compiles meanwhile
         vehicle = _diagnose(effects(), programs.game.airframe)
         seconds["diagnosis"] = time.monotonic() - start
+        tell("diagnosing and compiling", f"found: {', '.join(sorted(vehicle.values)) or 'nothing'}")
     programs.ready()
     seconds["compiled"] = time.monotonic() - start
-    tell(next(steps))
-    tuning = programs.fine_tune(vehicle)
+    step = next(steps)
+    tell(step, "")
+    tuning = programs.fine_tune(vehicle, functools.partial(tell, step))
     seconds["fine-tuned"] = time.monotonic() - start
-    tell(next(steps))
+    tell(next(steps), "")
     rates = programs.measure(vehicle, tuning.parameters)
     seconds["measured"] = time.monotonic() - start
     results = {**_results(command, vehicle, rates, tuning), "seconds": seconds}
@@ -143,14 +149,19 @@ class _Programs:
         key = jax.random.fold_in(self._key, number)
         return episode_figures(self._evaluate(parameters, tasks, key, bounds).statistics)
 
-    def fine_tune(self, vehicle: _Diagnosed):
+    def fine_tune(self, vehicle: _Diagnosed, tell: Callable[[str], None]):
         """The best of the policy's updates (see
-        `openjax.learning.fine_tuning.fine_tune`).
+        `openjax.learning.fine_tuning.fine_tune`); `tell` is told of each look at it.
         """
         # the same draws for all that is compared, here and in each look
         usual = self._fly(self._parameters, self._chosen_by, 1, self._nominal)
 
+        settings = self.adaptation.settings
+        looks = itertools.count()
+
         def look(policy):
+            update = min(next(looks) * settings.look_every, settings.updates)
+            tell(f"{update} of {settings.updates} updates")
             episodes = self._fly(policy, self._chosen_by, 1, vehicle.bounds)
             return look_of(episodes, usual, self.game.episode_length)
 

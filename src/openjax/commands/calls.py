@@ -2,61 +2,72 @@
 in Python.
 """
 
+import dataclasses
+import inspect
 import time
-from collections.abc import Callable, Mapping
+import typing
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 
 from openjax.background import quiet_compiler
 from openjax.cluster.processes import Processes
+from openjax.commands.evaluate import EvaluateCommand, fly_scenarios
 from openjax.errors import UserError
-from openjax.learning import Learner, TrainSettings, preset
-from openjax.policy import Network, Policy
-from openjax.pursuit import Observation, Pursuit, PursuitSettings
+from openjax.learning import TrainSettings, preset
+from openjax.pursuit import Observation, PursuitSettings
 from openjax.pursuit.evaders import Evader
-from openjax.ranges import changed
+from openjax.ranges import changed, check_intervals
 from openjax.runs.job import OwnParts
 from openjax.runs.start import TrainCommand, check_resumed, default_preset, start
 from openjax.store.policies import LoadedPolicy, load_policy, own_controller
 from openjax.store.run_directory import open_run
 
 
+def _with_fields(*kinds: type) -> Callable:
+    """Have a function's signature show the fields of dataclasses, which it takes as
+    keywords.
+    """
+
+    def show(function):
+        signature = inspect.signature(function)
+        *parameters, others = signature.parameters.values()
+        names = {parameter.name for parameter in parameters}
+        for kind in kinds:
+            for field in dataclasses.fields(kind):
+                if field.name not in names and field.default is not dataclasses.MISSING:
+                    names.add(field.name)
+                    parameters.append(
+                        inspect.Parameter(
+                            field.name,
+                            inspect.Parameter.KEYWORD_ONLY,
+                            default=field.default,
+                            annotation=field.type,
+                        )
+                    )
+        function.__signature__ = signature.replace(parameters=[*parameters, others])
+        return function
+
+    return show
+
+
+@_with_fields(OwnParts, TrainCommand)
 def train(
     settings: TrainSettings | None = None,
     out: str | Path | None = None,
-    *,
-    minutes: float | None = None,
-    start_from: str | None = None,
-    compare_with: str | None = None,
-    devices: str = "1",
-    vehicle: str | Path | None = None,
-    effects: str | Path | None = None,
-    overwrite: bool = False,
-    resume: str | Path | None = None,
-    environment: Pursuit | None = None,
-    policy: Policy | Network | None = None,
-    learners: Mapping[str, Learner] | None = None,
+    **options: Any,
 ) -> LoadedPolicy:
     """Train as `openjax train` does, with its progress, checkpoints and pictures.
 
     Args:
       settings: of the run; None is the preset for this machine (`openjax.preset`).
       out: directory of the run; None is runs/DATE.
-      minutes: of learning; compiling comes before, the report after.
-      start_from: policy whose networks the run starts with.
-      compare_with: policy that the final table and the animation show beside the
-      trained one.
-      devices: how many, or "all".
-      vehicle, effects: files to fly with, vehicle.toml and effects.toml.
-      overwrite: replace a run that `out` already holds.
-      resume: directory of a run to go on with, in place of `out`; `settings` are its
-      own by default, and parts of one's own are to be the same.
-      environment: a game of one's own, with its evaders, reward, observations; its
-      settings go before those of the run.
-      policy: a network of one's own (`openjax.policy.Network`), or a whole policy.
-      learners: of one's own by name (`openjax.learning.Learner`), beside the shipped
-      ones, or in the place of `predictor`, `evaders` or `policy`, which is MAPPO.
+      options: those of `openjax train` (`openjax.runs.train_command.TrainCommand`), such
+      as minutes, start_from, vehicle, effects, overwrite or resume; and what only Python
+      has (`openjax.runs.job.OwnParts`): environment, policy and learners of one's own, and
+      on_record.
 
     Returns:
       The best policy of the run.
@@ -64,53 +75,53 @@ def train(
     Raises:
       UserError: settings or files that can't be used, or a run that ended by a NaN.
     """
-    saved_settings = None if resume is None else open_run(Path(resume)).read_settings()
-    if resume is None and out is None:
-        out = Path("runs") / time.strftime("%Y%m%d-%H%M%S")
-    # by the command's own options, so that both are checked by the same code
-    command = TrainCommand(
-        out=_path(out),
-        resume=_path(resume),
-        minutes=minutes,
-        start_from=start_from,
-        compare_with=compare_with or "none",
-        devices=str(devices),
-        vehicle=_path(vehicle),
-        effects=_path(effects),
-        overwrite=overwrite,
-        # a caller may have changed functions since they were loaded
-        traced_programs=False,
-        settings=settings or saved_settings or preset(default_preset()),
+    names = [field.name for field in dataclasses.fields(OwnParts)]
+    own = OwnParts(**{name: options.pop(name) for name in names if name in options})
+    command = _typed(TrainCommand, {**options, "out": out})
+    if command.resume is None and command.out is None:
+        command = dataclasses.replace(command, out=Path("runs") / time.strftime("%Y%m%d-%H%M%S"))
+    stored = None if command.resume is None else open_run(command.resume).read_settings()
+    command = dataclasses.replace(
+        command,
+        # nobody reads a table, and other work may be on the other cores
+        compare_with=command.compare_with or "none",
+        devices=command.devices or "1",
+        settings=settings or stored or preset(command.preset or default_preset()),
     )
-    if saved_settings is not None:
-        check_resumed(command, saved_settings)
-    return _train(command, OwnParts(environment, policy, learners))
-
-
-def _train(command, parts):
-    """The policy of a run, as `train` gives it."""
+    if stored is not None:
+        check_resumed(command, stored)
     with quiet_compiler():
-        status = start(command, ["(called from Python)"], time.monotonic(), Processes(), parts)
+        status = start(command, ["(called from Python)"], time.monotonic(), Processes(), own)
     run = command.resume or command.out
     if status:
         raise UserError(f"training in {run} stopped at a NaN; what is left to look at lies there")
-    return load_policy(run, parts.environment, parts.policy)
+    return load_policy(run, own.environment, own.policy)
 
 
-def _path(name):
-    return None if name is None else Path(name)
+def _typed(kind, options):
+    """A command with these options, whose paths may be text. Raises UserError for one that
+    it doesn't have, or a number outside its interval.
+    """
+    hints = typing.get_type_hints(kind)
+    values = {
+        name: Path(value) if Path in typing.get_args(hints.get(name)) else value
+        for name, value in options.items()
+        if value is not None
+    }
+    if "devices" in values:
+        values["devices"] = str(values["devices"])
+    command = changed(kind(), **values)
+    check_intervals(command)
+    return command
 
 
+@_with_fields(EvaluateCommand)
 def evaluate(
     policy: LoadedPolicy | str | Path | Callable[[Observation], jax.Array],
-    scenario: str = "all",
+    scenario: str | Path = "all",
     *,
-    episodes: int = 100,
-    seed: int = 0,
-    vehicle: str | Path | None = None,
-    effects: str | Path | None = None,
     opponent: str | Path | Evader | None = None,
-    **changes,
+    **options: Any,
 ) -> dict | list[dict]:
     """Fly a policy's mean on layouts as `openjax evaluate` does.
 
@@ -120,14 +131,12 @@ def evaluate(
         nominal game.
       scenario: a layout's name, a TOML file with an own one, "uniform", or "all"; see
         `openjax evaluate --help`.
-      episodes: per layout.
-      seed: draws the start attitudes.
-      vehicle, effects: files to fly with, vehicle.toml and effects.toml.
       opponent: evader to fly against: a name in `openjax.pursuit.evaders.SCRIPTED`, a
       file, or a function of one's own, velocity(scene, memory) -> velocity (3,) in m/s,
       memory (`openjax.pursuit.evaders.EvaderKind`); None: those of the policy's game.
-      changes: of the game that the policy was trained in, for example
-      speed_limit="none".
+      options: those of `openjax evaluate` (`openjax.commands.evaluate.EvaluateCommand`),
+      such as episodes, seed, vehicle or effects; and changes of the game that the policy
+      was trained in, such as speed_limit="none".
 
     Returns:
       A record, or a list of them for "all": scenario, episodes; capture_rate,
@@ -139,21 +148,17 @@ def evaluate(
     Raises:
       UserError: an unusable layout, or a game that the policy can't play.
     """
-    from openjax.commands.evaluate import EvaluateCommand, fly_scenarios
-
+    names = [field.name for field in dataclasses.fields(EvaluateCommand)]
+    changes = {name: options.pop(name) for name in list(options) if name not in names}
     if isinstance(policy, str | Path):
         policy = load_policy(policy)
     elif not isinstance(policy, LoadedPolicy):
-        policy = own_controller(policy, changed(PursuitSettings(), **changes), "own controller")
-    number = changes.pop("num_pursuers", None)
-    command = EvaluateCommand(
+        number = {name: options[name] for name in options if name == "num_pursuers"}
+        game = changed(PursuitSettings(), **changes, **number)
+        policy = own_controller(policy, game, "own controller")
+    command = dataclasses.replace(
+        _typed(EvaluateCommand, {**options, "scenario": str(scenario)}),
         policy=(policy.source,),
-        scenario=str(scenario),
-        episodes=episodes,
-        num_pursuers=number,
-        seed=seed,
-        vehicle=_path(vehicle),
-        effects=_path(effects),
         opponent=str(opponent) if isinstance(opponent, Path) else opponent,
         environment=changed(policy.settings.environment, **changes),
     )

@@ -3,8 +3,9 @@ start. `openjax.runs.training` goes about it.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,22 +28,32 @@ from openjax.store.policy_files import fill
 
 @dataclasses.dataclass(frozen=True)
 class OwnParts:
-    """Parts of a run that were handed in from Python; see `openjax.learning.build`."""
+    """What was handed in from Python; see `openjax.learning.build`. A resumed run takes the
+    same parts again.
+    """
 
     environment: Pursuit | None = None
+    """A game of one's own, with its evaders, reward, observations; its settings go before
+    those of the run.
+    """
     policy: Policy | Network | None = None
+    """A network of one's own (`openjax.policy.Network`), or a whole policy."""
     learners: Mapping[str, Learner] | None = None
+    """Learners of one's own by name (`openjax.learning.Learner`), beside the shipped ones, or
+    in the place of `predictor`, `evaders` or `policy`, which is MAPPO.
+    """
+    on_record: Callable[[dict], Any] | None = None
+    """Called with each record of `metrics.jsonl` once it is written: event (train or
+    validation), update, steps, seconds and numbers by name. `wandb.log` takes it.
+    """
 
     @property
     def names(self) -> list[str]:
-        """What they are: a run that was begun with them goes on with the same ones
-        only.
+        """The parts that there are: a run that was begun with them goes on with the same
+        ones only.
         """
-        parts = [field.name for field in dataclasses.fields(self) if getattr(self, field.name)]
+        parts = [name for name in ("environment", "policy", "learners") if getattr(self, name)]
         return parts + [f"learner {name}" for name in self.learners or ()]
-
-
-ALL_SHIPPED = OwnParts()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +65,7 @@ class TrainingJob:
     parts: Parts
     """Environment, policy and learners."""
     own: OwnParts
-    """Those of them that were handed in from Python."""
+    """What was handed in from Python."""
     devices: int
     """Of all processes together."""
     processes: Processes

@@ -178,6 +178,30 @@ def _plan(run, reached):
 
 def _metrics(run, reached):
     """What writes metrics: afresh, or on from where a checkpoint was."""
+    go_on = {}
+    if reached.is_restored:
+        go_on = {
+            "resumed_update": reached.update,
+            "resumed_steps": reached.update * run.job.settings.steps_per_update,
+            "drop_validation": reached.is_due,
+        }
+    return MetricsWriter(run.directory.path, on_record=run.job.own.on_record, **go_on)
+
+
+def _plan(run, reached):
+    """What is left to do from now on."""
+    settings = run.job.settings
+    return Plan(
+        total_updates=settings.total_updates,
+        steps_per_update=settings.steps_per_update,
+        validation_interval=settings.validation_interval,
+        time_limit=min(reached.deadline - time.monotonic(), run.job.time_limit),
+        validate_start=reached.is_due,
+    )
+
+
+def _metrics(run, reached):
+    """What writes metrics: afresh, or on from where a checkpoint was."""
     if not reached.is_restored:
         return MetricsWriter(run.directory.path)
     steps = reached.update * run.job.settings.steps_per_update

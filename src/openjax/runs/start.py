@@ -19,7 +19,7 @@ from openjax.errors import UserError
 from openjax.files import remove_unfinished, to_plain
 from openjax.learning import TrainSettings, build, preset
 from openjax.ranges import check_intervals
-from openjax.runs.job import ALL_SHIPPED, OwnParts, TrainingJob, check_job, start_parameters
+from openjax.runs.job import OwnParts, TrainingJob, check_job, start_parameters
 from openjax.runs.machine import describe_machine
 from openjax.runs.other_policy import other_policy
 from openjax.runs.train_command import MAY_CHANGE, PROGRAM, TrainCommand
@@ -29,7 +29,14 @@ from openjax.store.checkpoints import Checkpoints
 from openjax.store.compiled_programs import cache_programs
 from openjax.store.environments import is_evader_file, make_environment
 from openjax.store.policies import known_policies
-from openjax.store.run_directory import RunDirectory, check_free, create_run, lock_run, open_run
+from openjax.store.run_directory import (
+    RunDirectory,
+    check_free,
+    create_run,
+    lock_run,
+    open_run,
+    read_config,
+)
 from openjax.vehicle.vehicle_file import copy_vehicle_file, load_vehicle_file
 
 
@@ -41,14 +48,18 @@ def read_command(arguments: Sequence[str]) -> TrainCommand:
     """
     resume = peek(arguments, "resume")
     name = peek(arguments, "preset")
+    config = peek(arguments, "config")
     if resume is not None:
-        if name is not None:
-            raise UserError(
-                "--preset and --resume exclude each other: a resumed run keeps its settings"
-            )
+        for option, value in (("preset", name), ("config", config)):
+            if value is not None:
+                raise UserError(
+                    f"--{option} and --resume exclude each other: a resumed run keeps its settings"
+                )
         default = open_run(Path(resume)).read_settings()
     else:
         default = preset(name or default_preset())
+        if config is not None:
+            default = read_config(Path(config), default)
     command = parse(TrainCommand, TrainCommand(settings=default), arguments, PROGRAM)
     if resume is not None:
         check_resumed(command, default)
@@ -94,7 +105,7 @@ def start(
     arguments: Sequence[str],
     start_time: float,
     processes: Processes,
-    own: OwnParts = ALL_SHIPPED,
+    own: OwnParts | None = None,
 ) -> int:
     """Make the run's directory, or open it, and train. Returns the exit status.
 
@@ -103,11 +114,12 @@ def start(
       arguments: the command line, for the run's facts.
       start_time: `time.monotonic()` when the command started.
       processes: that train together.
-      own: parts that were handed in from Python.
+      own: what was handed in from Python; None: nothing, the command was typed.
     """
     cache = cache_programs() if command.compilation_cache else None
     job, directory, files = prepare(command, arguments, start_time, processes, own)
-    if command.traced_programs and cache is not None:
+    # a caller may have changed functions since they were loaded
+    if cache is not None and own is None:
         job = dataclasses.replace(job, traced=cache / "traced")
     # a mistake shows before any process changes a file
     _check_same(job.settings, processes)
@@ -139,7 +151,7 @@ def prepare(
     arguments: Sequence[str],
     start_time: float,
     processes: Processes,
-    own: OwnParts = ALL_SHIPPED,
+    own: OwnParts | None = None,
 ) -> tuple[TrainingJob, RunDirectory, dict[str, Path]]:
     """What to train, where, and the files to copy there, by their names; nothing is
     changed yet. Arguments as of `start`.
@@ -147,6 +159,9 @@ def prepare(
     Raises:
       UserError: whatever can be wrong with the files or the settings.
     """
+    if jax.config.jax_enable_x64:
+        raise UserError("jax_enable_x64 is on; openjax trains in 32 bits: turn it off")
+    own = own or OwnParts()
     old_run = None if command.resume is None else open_run(command.resume)
     stored_facts = {} if old_run is None else old_run.read_facts()
     files = _files(command, old_run)

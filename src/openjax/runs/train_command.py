@@ -31,6 +31,10 @@ class TrainCommand:
     pursuers; mappo: without predictor and generator; dacoop: parameters of a potential
     field. By default quick without an accelerator, else paper.
     """
+    config: Path | None = None
+    """Settings to begin with (.toml or .json), which change those of the preset; a run's
+    settings.json is one.
+    """
     out: Path | None = None
     """Directory of the run; by default runs/DATE-PRESET."""
     steps: Annotated[int | None, Interval("[1, 1e15]")] = None
@@ -71,11 +75,9 @@ class TrainCommand:
     process_id: Annotated[int | None, Interval("[0, 99999]")] = None
     """Which of them this one is, from 0. Slurm and Open MPI tell it."""
     compilation_cache: bool = True
-    """Keep compiled programs in the user's cache folder, so that the next run starts
-    sooner.
+    """Keep traced and compiled programs in the user's cache folder, so that the next run
+    starts sooner.
     """
-    traced_programs: bool = True
-    """Keep traced programs there, too, so that the next run traces nothing."""
     layout_episodes: Annotated[int | None, Interval("[1, 100000]")] = None
     """Episodes per layout in the final table; by default 100 on an accelerator, 32 on a
     CPU, and 1 where all are alike, as starts are level.

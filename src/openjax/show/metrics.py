@@ -3,8 +3,9 @@
 import json
 import math
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from openjax.files import replacing
 
@@ -25,6 +26,7 @@ class MetricsWriter:
       curves go on.
       drop_validation: whether the validation of `resumed_update` comes again, too.
       tensorboard: False leaves the event files out.
+      on_record: called with each record after it is written.
     """
 
     def __init__(
@@ -34,6 +36,7 @@ class MetricsWriter:
         resumed_steps: int = 0,
         drop_validation: bool = False,
         tensorboard: bool = True,
+        on_record: Callable[[dict], Any] | None = None,
     ):
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
@@ -44,6 +47,7 @@ class MetricsWriter:
         else:
             truncate_metrics(path, resumed_update, drop_validation)
         self._file = open(path, "ab", buffering=0)
+        self._on_record = on_record
         self._events = None
         if tensorboard:
             from tensorboardX import SummaryWriter
@@ -83,6 +87,8 @@ class MetricsWriter:
                 if math.isfinite(value):
                     self._events.add_scalar(f"{event}/{name}", value, int(steps))
             self._events.flush()
+        if self._on_record is not None:
+            self._on_record(record)
 
     def close(self) -> None:
         """Close both files."""

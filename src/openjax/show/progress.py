@@ -205,13 +205,23 @@ class Steps(_Display):
 
     def begin(self, step: str, note: str = "") -> None:
         """The step before is done, and `step` begins; one that isn't in `durations`
-        takes no time of its own.
+        takes no time of its own. Into a file, a long step is told, and each of its notes.
         """
-        if step != self._step:
+        is_other = step != self._step
+        if is_other:
             self._done += self._durations.get(self._step, 0.0)
             self._step = step
             self._step_start = time.monotonic()
+        is_told = self._durations.get(step, 0.0) > LONG and (is_other or note != self._note)
         self._note = note
+        if is_told and not self._console.is_terminal:
+            left = duration(self.seconds_left(time.monotonic()))
+            self._console.print(Text(f"{self._text()}, about {left} left"), soft_wrap=True)
+            self._console.file.flush()
+
+    def _text(self):
+        text = f"{self._title}: {self._step or 'starting'}"
+        return f"{text} ({self._note})" if self._note else text
 
     def seconds_left(self, moment: float) -> float:
         """Until all steps are done, at a moment of `time.monotonic`."""
@@ -227,13 +237,10 @@ class Steps(_Display):
         time_read = time.monotonic()
         seconds = self.seconds_left(time_read)
         share = (time_read - self._start) / max(time_read - self._start + seconds, 1e-6)
-        text = f"{self._title}: {self._step or 'starting'}"
-        if self._note:
-            text += f" ({self._note})"
         row = Table.grid(padding=(0, 1))
         row.add_row(
             self._spinner,
-            Text(text),
+            Text(self._text()),
             ProgressBar(total=1.0, completed=share, width=24),
             Text(f"about {duration(seconds)} left", style="dim"),
         )

@@ -21,7 +21,15 @@ from pathlib import Path
 from typing import Any
 
 from openjax.errors import UserError
-from openjax.files import WRITING, check_output_folder, read_json, remove_unfinished, write_json
+from openjax.files import (
+    WRITING,
+    check_output_folder,
+    read_json,
+    read_toml,
+    remove_unfinished,
+    to_plain,
+    write_json,
+)
 from openjax.learning import TrainSettings
 from openjax.plain import from_plain
 
@@ -95,6 +103,32 @@ class RunDirectory:
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise UserError(f"{self.settings_file} isn't of the format {_FORMAT!r}")
         return from_plain(TrainSettings, content.get("settings"), f"{self.settings_file}: ")
+
+
+def read_config(path: Path, default: TrainSettings) -> TrainSettings:
+    """Settings with what a file changes: a TOML or JSON file of them, or a run's own.
+
+    Raises:
+      UserError: no such file, or settings that there aren't.
+    """
+    if path.suffix == ".toml":
+        changes = read_toml(path, "settings file")
+    else:
+        changes = read_json(path)
+        if isinstance(changes, dict) and changes.get("format") == _FORMAT:
+            changes = changes.get("settings")
+    if not isinstance(changes, dict):
+        raise UserError(f"{path} holds no settings by name")
+    return from_plain(TrainSettings, _merged(to_plain(default), changes), f"{path}: ")
+
+
+def _merged(settings, changes):
+    """Plain settings with others in their place, group by group."""
+    merged = dict(settings)
+    for name, value in changes.items():
+        is_group = isinstance(value, dict) and isinstance(merged.get(name), dict)
+        merged[name] = _merged(merged[name], value) if is_group else value
+    return merged
 
 
 def is_run(path: Path) -> bool:
