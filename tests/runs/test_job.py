@@ -28,6 +28,7 @@ GOOD = {
     "collision_rate": 0.0,
     "crash_rate": 0.0,
     "over_speed_rate": 0.0,
+    "prediction_error": float("nan"),  # nothing predicts
 }
 
 
@@ -80,7 +81,8 @@ def test_last_stage_keeps_what_validates_best_and_ends_when_asked(
         np.testing.assert_allclose(leaf, first[name] + kept, atol=1e-6)
     assert (notes["update"], notes.get("analytic_updates", 0)) == (7, 5 * kept)
     assert ("not kept" in message) == (kept == 0)
-    assert read_json(tmp_path / "analytic.json")["kept"] == 5 * kept
+    written = read_json(tmp_path / "analytic.json")
+    assert written["kept"] == 5 * kept and written["validation"][0]["prediction_error"] is None
 
 
 def test_a_vehicle_that_is_known_by_name_needs_no_file_in_the_run(tmp_path):

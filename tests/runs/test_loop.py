@@ -18,7 +18,7 @@ from rich.console import Console
 
 from openjax.interruption import StopRequest
 from openjax.runs.loop import Loop, NotFiniteError, Plan, guarded
-from openjax.show.metrics import MetricsWriter, read_metrics
+from openjax.show.metrics import Continuation, MetricsWriter, read_metrics
 from openjax.show.progress import Progress
 from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
@@ -86,7 +86,9 @@ def run(directory, compiled_step, updates, resume=False, evaluate=None, **option
         first = record.update
     else:
         carry = place(init())
-    metrics = MetricsWriter(directory, resumed_update=first if resume else None, tensorboard=False)
+    metrics = MetricsWriter(
+        directory, continuation=Continuation(first) if resume else None, tensorboard=False
+    )
     plan = Plan(total_updates=updates, steps_per_update=10, **{"validation_interval": 4, **options})
     with Progress("toy", 10 * updates, Console(quiet=True)) as progress, StopRequest() as stop:
         try:
@@ -185,9 +187,9 @@ def test_a_run_that_goes_on_keeps_its_validations_once(tmp_path):
         writer.close()
 
     write(0, 4)
-    write(resumed_update=0)
+    write(continuation=Continuation(0))
     assert validations() == [0]
-    write(0, 4, resumed_update=0, drop_validation=True)
+    write(0, 4, continuation=Continuation(0, drop_validation=True))
     assert validations() == [0, 4]
 
 

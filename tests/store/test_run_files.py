@@ -14,7 +14,7 @@ from PIL import Image
 from openjax.errors import UserError
 from openjax.files import replacing, to_plain
 from openjax.plain import from_plain
-from openjax.show.metrics import MetricsWriter, read_metrics
+from openjax.show.metrics import Continuation, MetricsWriter, read_metrics
 from openjax.show.plots import plot_training, plot_trajectories
 from openjax.show.trajectory import Trajectory
 from openjax.show.videos import (
@@ -85,7 +85,7 @@ def test_metrics_survive_a_kill_and_are_cut_to_the_resumed_update(tmp_path):
         file.write(b'{"event": "train", "upd')
     assert [r["loss"] for r in read_metrics(tmp_path / "metrics.jsonl")] == [1, None, 3, 4, 5]
     told = []
-    MetricsWriter(tmp_path, resumed_update=3, tensorboard=False, on_record=told.append).write(
+    MetricsWriter(tmp_path, Continuation(3), tensorboard=False, on_record=told.append).write(
         "train", 4, 40, 0.1, {"loss": 40}
     )
     assert told == [{"event": "train", "update": 4, "steps": 40, "seconds": 0.1, "loss": 40}]

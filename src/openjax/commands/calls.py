@@ -76,29 +76,29 @@ def train(
       UserError: settings or files that can't be used, or a run that ended by a NaN.
     """
     names = [field.name for field in dataclasses.fields(OwnParts)]
-    own = OwnParts(**{name: options.pop(name) for name in names if name in options})
-    command = _typed(TrainCommand, {**options, "out": out})
+    parts = OwnParts(**{name: options.pop(name) for name in names if name in options})
+    command = _command_of(TrainCommand, {**options, "out": out})
     if command.resume is None and command.out is None:
         command = dataclasses.replace(command, out=Path("runs") / time.strftime("%Y%m%d-%H%M%S"))
-    stored = None if command.resume is None else open_run(command.resume).read_settings()
+    stored_settings = None if command.resume is None else open_run(command.resume).read_settings()
     command = dataclasses.replace(
         command,
         # nobody reads a table, and other work may be on the other cores
         compare_with=command.compare_with or "none",
         devices=command.devices or "1",
-        settings=settings or stored or preset(command.preset or default_preset()),
+        settings=settings or stored_settings or preset(command.preset or default_preset()),
     )
-    if stored is not None:
-        check_resumed(command, stored)
+    if stored_settings is not None:
+        check_resumed(command, stored_settings)
     with quiet_compiler():
-        status = start(command, ["(called from Python)"], time.monotonic(), Processes(), own)
+        status = start(command, ["(called from Python)"], time.monotonic(), Processes(), parts)
     run = command.resume or command.out
     if status:
         raise UserError(f"training in {run} stopped at a NaN; what is left to look at lies there")
-    return load_policy(run, own.environment, own.policy)
+    return load_policy(run, parts.environment, parts.policy)
 
 
-def _typed(kind, options):
+def _command_of(kind, options):
     """A command with these options, whose paths may be text. Raises UserError for one that
     it doesn't have, or a number outside its interval.
     """
@@ -157,7 +157,7 @@ def evaluate(
         game = changed(PursuitSettings(), **changes, **number)
         policy = own_controller(policy, game, "own controller")
     command = dataclasses.replace(
-        _typed(EvaluateCommand, {**options, "scenario": str(scenario)}),
+        _command_of(EvaluateCommand, {**options, "scenario": str(scenario)}),
         policy=(policy.source,),
         opponent=str(opponent) if isinstance(opponent, Path) else opponent,
         environment=changed(policy.settings.environment, **changes),

@@ -64,7 +64,7 @@ class TrainingJob:
     """What was asked for, with what the machine or a resumed run adds to it."""
     parts: Parts
     """Environment, policy and learners."""
-    own: OwnParts
+    own_parts: OwnParts
     """What was handed in from Python."""
     devices: int
     """Of all processes together."""
@@ -102,7 +102,9 @@ def check_job(job: TrainingJob) -> None:
         )
     check_devices(settings, job.devices)
     check_memory(settings, job.devices)
-    if job.own.policy is not None and (settings.first_flights.updates or settings.analytic.updates):
+    if job.own_parts.policy is not None and (
+        settings.first_flights.updates or settings.analytic.updates
+    ):
         raise UserError(
             "first_flights.updates and analytic.updates must be 0 for a policy of one's "
             "own: these stages need the shipped networks"

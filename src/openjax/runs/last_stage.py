@@ -85,8 +85,15 @@ def keep_best(
         "validation_scores": scores,
     }
     report = policy.path.with_name("analytic.json")
-    write_json(report, {**facts, "validation": looks, "history": history})
+    write_json(report, {**facts, "validation": list(map(_plain, looks)), "history": history})
     return _in_words(facts, len(history), scores[best])
+
+
+def _plain(summary):
+    """A summary as JSON holds it: nothing in place of what wasn't measured, as a prediction
+    where nothing predicts.
+    """
+    return {name: None if value != value else value for name, value in summary.items()}
 
 
 def _is_looked_at(stage, update):

@@ -64,13 +64,13 @@ def make_programs(job: TrainingJob, has_begun: bool, is_done: bool) -> Programs:
     first_flights = None
     if settings.first_flights.updates and not has_begun and job.start is None:
         first_flights = compile_first_flights(job, carry.policy, kept_programs(job))
-    later = [
+    background = [
         functools.partial(_give_way, step_ready),
         functools.partial(_make_validation, job, carry.policy),
         functools.partial(compile_last_stage, job, carry.policy),
     ]
     # the first process alone validates and writes
-    _, validation, last_stage = one_by_one(later) if job.processes.is_first else (None,) * 3
+    _, validation, last_stage = one_by_one(background) if job.processes.is_first else (None,) * 3
     return Programs(carry, start, step, step_ready, first_flights, validation, last_stage)
 
 
@@ -141,7 +141,7 @@ def kept_programs(job: TrainingJob) -> Callable | None:
     one's own are in them, whose text nobody knows.
     """
     game = job.parts.environment
-    if job.traced is None or job.own.names or game.evaders or game.reward or game.observer:
+    if job.traced is None or job.own_parts.names or game.evaders or game.reward or game.observer:
         return None
     return functools.partial(recall, made_from=_made_from(job), folder=job.traced)
 

@@ -19,7 +19,7 @@ from openjax.runs.last_stage import BestPolicy, keep_best
 from openjax.runs.loop import Loop, Outcome, Plan, Stopped
 from openjax.runs.programs import Programs
 from openjax.runs.words import first_flights_words, how_to_go_on
-from openjax.show.metrics import MetricsWriter
+from openjax.show.metrics import Continuation, MetricsWriter
 from openjax.show.progress import Progress
 from openjax.store.checkpoints import CheckpointRecord, Checkpoints
 from openjax.store.leaves import place
@@ -52,7 +52,7 @@ class Run:
 
 
 @dataclasses.dataclass(frozen=True)
-class Reached:
+class RunState:
     """How far a run has come before its updates go on."""
 
     carry: TrainCarry
@@ -68,7 +68,7 @@ class Reached:
     """When the time for learning is over (`time.monotonic`)."""
 
 
-def begin(run: Run) -> Reached:
+def begin(run: Run) -> RunState:
     """The newest checkpoint, or a fresh carry; the settings, or the policy to begin with, are
     written.
     """
@@ -82,7 +82,7 @@ def begin(run: Run) -> Reached:
         is_due = awaits_validation(record, job)
         if job.processes.is_first:
             run.directory.write_settings(settings, job.facts)
-        return Reached(carry, record.update, float(record.notes.get("seconds", 0.0)), True, is_due)
+        return RunState(carry, record.update, float(record.notes.get("seconds", 0.0)), True, is_due)
     carry = run.programs.start(jax.random.key(settings.seed))
     if job.start is not None:
         critic = job.start.critic or carry.policy.critic
@@ -91,7 +91,7 @@ def begin(run: Run) -> Reached:
         notes = {"update": 0}
         path = run.directory.start_policy
         save_policy_file(path, carry.policy, settings, notes, storage="float32")
-    return Reached(place(carry, carry_shardings(job.devices)), 0, 0.0, False, False)
+    return RunState(place(carry, carry_shardings(job.devices)), 0, 0.0, False, False)
 
 
 def awaits_validation(record: CheckpointRecord, job: TrainingJob) -> bool:
@@ -108,105 +108,126 @@ def awaits_validation(record: CheckpointRecord, job: TrainingJob) -> bool:
     return is_validated and record.score is None
 
 
-def fly_first(run: Run, reached: Reached) -> Reached:
+def fly_first(run: Run, state: RunState) -> RunState:
     """The policy after the stage before MAPPO, of a run that has it still to come."""
     program = run.programs.first_flights
     if program is None:
-        return reached
+        return state
     job = run.job
     run.progress.phase("compiling the first flights")
     program.wait()
     deadline = time.monotonic() + job.time_limit
     run.progress.phase("learning to fly by the gradient through the simulation")
     key = jax.random.fold_in(jax.random.key(job.settings.seed), 1)
-    policy = reached.carry.policy
+    policy = state.carry.policy
     learnt = program.learn(policy, key, run.progress.message, lambda: run.is_over(deadline))
     if learnt is None:
-        return dataclasses.replace(reached, deadline=deadline)
+        return dataclasses.replace(state, deadline=deadline)
     policy = policy.replace(actor=place(learnt.actor, everywhere(job.devices)))
-    carry = reached.carry.replace(policy=policy)
-    return dataclasses.replace(reached, carry=carry, is_due=True, deadline=deadline)
+    carry = state.carry.replace(policy=policy)
+    return dataclasses.replace(state, carry=carry, is_due=True, deadline=deadline)
 
 
-def learn(run: Run, reached: Reached) -> Outcome:
+def learn(run: Run, state: RunState) -> Outcome:
     """All updates, until a signal or the time limit.
 
     Raises:
       Stopped: one of them came before anything was learnt, or a NaN.
     """
-    over = run.is_over(reached.deadline)
-    if over and not reached.is_restored and not reached.is_due:
+    over = run.is_over(state.deadline)
+    if over and not state.is_restored and not state.is_due:
         reason = run.stop.name or "the time limit"
         words = how_to_go_on(run.checkpoints, run.directory)
         raise Stopped(f"{reason} came: {words}; ending as soon as the compiler does")
     with contextlib.ExitStack() as stack:
         metrics = None
         if run.job.processes.is_first:
-            metrics = stack.enter_context(contextlib.closing(_metrics(run, reached)))
-        goes_on = not over and reached.update < run.job.settings.total_updates
+            metrics = stack.enter_context(contextlib.closing(_metrics(run, state)))
+        goes_on = not over and state.update < run.job.settings.total_updates
         run.progress.phase("compiling the training step", announce=goes_on)
         if goes_on:
             run.programs.step_ready()
         loop = Loop(
             run.programs.step,
-            _plan(run, reached),
+            _plan(run, state),
             checkpoints=run.checkpoints,
             metrics=metrics,
             progress=run.progress,
             directory=run.directory.path,
             stop=run.stop,
             evaluate=Evaluation(run),
-            first_update=reached.update,
-            seconds=reached.seconds + time.monotonic() - run.job.began,
+            first_update=state.update,
+            seconds=state.seconds + time.monotonic() - run.job.began,
             everyone=run.job.processes.everyone,
         )
         stack.enter_context(run.stop.while_learning())
-        return loop.run(reached.carry)
+        return loop.run(state.carry)
 
 
-def _plan(run, reached):
+def _plan(run, state):
     """What is left to do from now on."""
     settings = run.job.settings
     return Plan(
         total_updates=settings.total_updates,
         steps_per_update=settings.steps_per_update,
         validation_interval=settings.validation_interval,
-        time_limit=min(reached.deadline - time.monotonic(), run.job.time_limit),
-        validate_start=reached.is_due,
+        time_limit=min(state.deadline - time.monotonic(), run.job.time_limit),
+        validate_start=state.is_due,
     )
 
 
-def _metrics(run, reached):
+def _metrics(run, state):
+    """What writes metrics: afresh, or on from where a checkpoint was."""
+    continuation = None
+    if state.is_restored:
+        steps = state.update * run.job.settings.steps_per_update
+        continuation = Continuation(state.update, steps, state.is_due)
+    return MetricsWriter(run.directory.path, continuation, on_record=run.job.own_parts.on_record)
+
+
+def _plan(run, state):
+    """What is left to do from now on."""
+    settings = run.job.settings
+    return Plan(
+        total_updates=settings.total_updates,
+        steps_per_update=settings.steps_per_update,
+        validation_interval=settings.validation_interval,
+        time_limit=min(state.deadline - time.monotonic(), run.job.time_limit),
+        validate_start=state.is_due,
+    )
+
+
+def _metrics(run, state):
     """What writes metrics: afresh, or on from where a checkpoint was."""
     go_on = {}
-    if reached.is_restored:
+    if state.is_restored:
         go_on = {
-            "resumed_update": reached.update,
-            "resumed_steps": reached.update * run.job.settings.steps_per_update,
-            "drop_validation": reached.is_due,
+            "resumed_update": state.update,
+            "resumed_steps": state.update * run.job.settings.steps_per_update,
+            "drop_validation": state.is_due,
         }
-    return MetricsWriter(run.directory.path, on_record=run.job.own.on_record, **go_on)
+    return MetricsWriter(run.directory.path, on_record=run.job.own_parts.on_record, **go_on)
 
 
-def _plan(run, reached):
+def _plan(run, state):
     """What is left to do from now on."""
     settings = run.job.settings
     return Plan(
         total_updates=settings.total_updates,
         steps_per_update=settings.steps_per_update,
         validation_interval=settings.validation_interval,
-        time_limit=min(reached.deadline - time.monotonic(), run.job.time_limit),
-        validate_start=reached.is_due,
+        time_limit=min(state.deadline - time.monotonic(), run.job.time_limit),
+        validate_start=state.is_due,
     )
 
 
-def _metrics(run, reached):
+def _metrics(run, state):
     """What writes metrics: afresh, or on from where a checkpoint was."""
-    if not reached.is_restored:
+    if not state.is_restored:
         return MetricsWriter(run.directory.path)
-    steps = reached.update * run.job.settings.steps_per_update
+    steps = state.update * run.job.settings.steps_per_update
     return MetricsWriter(
-        run.directory.path, reached.update, resumed_steps=steps, drop_validation=reached.is_due
+        run.directory.path, state.update, resumed_steps=steps, drop_validation=state.is_due
     )
 
 

@@ -105,7 +105,7 @@ def start(
     arguments: Sequence[str],
     start_time: float,
     processes: Processes,
-    own: OwnParts | None = None,
+    own_parts: OwnParts | None = None,
 ) -> int:
     """Make the run's directory, or open it, and train. Returns the exit status.
 
@@ -114,12 +114,12 @@ def start(
       arguments: the command line, for the run's facts.
       start_time: `time.monotonic()` when the command started.
       processes: that train together.
-      own: what was handed in from Python; None: nothing, the command was typed.
+      own_parts: what was handed in from Python; None: nothing, the command was typed.
     """
     cache = cache_programs() if command.compilation_cache else None
-    job, directory, files = prepare(command, arguments, start_time, processes, own)
+    job, directory, files = prepare(command, arguments, start_time, processes, own_parts)
     # a caller may have changed functions since they were loaded
-    if cache is not None and own is None:
+    if cache is not None and own_parts is None:
         job = dataclasses.replace(job, traced=cache / "traced")
     # a mistake shows before any process changes a file
     _check_same(job.settings, processes)
@@ -151,7 +151,7 @@ def prepare(
     arguments: Sequence[str],
     start_time: float,
     processes: Processes,
-    own: OwnParts | None = None,
+    own_parts: OwnParts | None = None,
 ) -> tuple[TrainingJob, RunDirectory, dict[str, Path]]:
     """What to train, where, and the files to copy there, by their names; nothing is
     changed yet. Arguments as of `start`.
@@ -161,26 +161,26 @@ def prepare(
     """
     if jax.config.jax_enable_x64:
         raise UserError("jax_enable_x64 is on; openjax trains in 32 bits: turn it off")
-    own = own or OwnParts()
+    own_parts = own_parts or OwnParts()
     old_run = None if command.resume is None else open_run(command.resume)
     stored_facts = {} if old_run is None else old_run.read_facts()
     files = _files(command, old_run)
-    _check_parts(own, files, stored_facts)
-    environment = own.environment or _environment(command.settings.environment, files)
+    _check_parts(own_parts, files, stored_facts)
+    environment = own_parts.environment or _environment(command.settings.environment, files)
     command = _complete(command, environment, stored_facts)
     directory = old_run or RunDirectory(_free_directory(command, processes))
-    parts = build(command.settings, environment, own.policy, own.learners)
+    parts = build(command.settings, environment, own_parts.policy, own_parts.learners)
     # needed again only where a run was killed before its first checkpoint
     starts_from = None if _has_begun(old_run) else command.start_from
     job = TrainingJob(
         command=command,
         parts=parts,
-        own=own,
+        own_parts=own_parts,
         devices=int(command.devices),
         processes=processes,
         start=starts_from and start_parameters(starts_from, command.settings, parts),
         other=command.compare_with and other_policy(command.compare_with, environment),
-        facts=_facts(command, arguments, own),
+        facts=_facts(command, arguments, own_parts),
         began=start_time,
     )
     check_job(job)
@@ -205,10 +205,10 @@ def _complete(command, environment, stored_facts):
     return complete
 
 
-def _facts(command, arguments, own):
+def _facts(command, arguments, own_parts):
     """What is kept beside the settings, so that a resumed run goes on with it."""
     return {
-        **({"own_parts": own.names} if own.names else {}),
+        **({"own_parts": own_parts.names} if own_parts.names else {}),
         "command": " ".join([PROGRAM, *arguments]),
         "machine": describe_machine(),
         "devices": int(command.devices),

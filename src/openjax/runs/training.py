@@ -29,41 +29,37 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
     settings = job.settings
     if not job.processes.is_first:
         console = Console(quiet=True)
-    title = f"openjax.train → {directory.path}"
     job.processes.advice = f"go on with openjax train --resume {directory.path} --devices all"
     checkpoints = Checkpoints(directory.checkpoints, processes=job.processes)
     words = functools.partial(how_to_go_on, checkpoints, directory)
     with contextlib.ExitStack() as stack:
         stop = stack.enter_context(StopRequest())
-        progress = stack.enter_context(Progress(title, settings.total_steps, console))
+        progress = Progress(f"openjax.train → {directory.path}", settings.total_steps, console)
+        stack.enter_context(progress)
         stack.enter_context(interruption.clean_up(checkpoints.abandon))
         stack.enter_context(interruption.last_words(words))
-        try:
-            latest = checkpoints.latest()
-            is_done = job.processes.of_first(
-                latest is not None and latest.update >= settings.total_updates
+        has_begun = checkpoints.any_finished()
+        is_done = checkpoints.reach(settings.total_updates)
+        if is_done:
+            progress.message(
+                "all updates are done; --total_steps N goes on to more. Its report is made again"
             )
-            if is_done:
-                progress.message(
-                    "all updates are done; --total_steps N goes on to more. Its report is made anew"
-                )
-            progress.phase("compiling the start: networks, first tasks", announce=latest is None)
-            programs = make_programs(job, checkpoints.any_finished(), is_done)
+        progress.phase("compiling the start: networks, first tasks", announce=not has_begun)
+        try:
+            programs = make_programs(job, has_begun, is_done)
             run = Run(job, directory, checkpoints, programs, progress, stop)
-            reached = begin(run)
-            reached = fly_first(run, reached)
-            outcome = learn(run, reached)
-            improve(run, choose(run, outcome, reached.update))
+            state = begin(run)
+            state = fly_first(run, state)
+            outcome = learn(run, state)
+            improve(run, choose(run, outcome, state.update))
             table = report(job, directory, programs.validation(), outcome, progress)
         except Stopped as reason:
             progress.message(str(reason))
             return reason.status
     console.print(table)
     on_cpu = jax.default_backend() == "cpu"
-    for line in closing_words(settings, directory.path, on_cpu, job.own.policy is not None):
+    for line in closing_words(settings, directory.path, on_cpu, job.own_parts.policy is not None):
         console.print(line, soft_wrap=True)
-    console.print(
-        f"run, policy and pictures are in {directory.path}, the chase in chase.gif",
-        soft_wrap=True,
-    )
+    words = f"run, policy and pictures are in {directory.path}, the chase in chase.gif"
+    console.print(words, soft_wrap=True)
     return 0

@@ -88,8 +88,8 @@ def closing_words(
 def how_to_go_on(checkpoints: Checkpoints, directory: RunDirectory) -> str:
     """What there is of a run, and how it goes on, should it end now."""
     update = checkpoints.last_finished()
-    saved = "nothing was learnt yet" if update is None else f"saved at update {update}"
-    return f"{saved}; go on with {as_typed(f'openjax train --resume {directory.path}')}"
+    words = "nothing was learnt yet" if update is None else f"saved at update {update}"
+    return f"{words}; go on with {as_typed(f'openjax train --resume {directory.path}')}"
 
 
 def first_flights_words(summary: dict) -> str:

@@ -5,11 +5,21 @@ import math
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from openjax.files import replacing
 
 METRICS_FILE = "metrics.jsonl"
+
+
+class Continuation(NamedTuple):
+    """Where a run goes on; records of later updates are removed, as they come again."""
+
+    update: int
+    steps: int = 0
+    """Environment steps done by then, where TensorBoard's curves go on."""
+    drop_validation: bool = False
+    """Whether the validation of this update comes again, too."""
 
 
 class MetricsWriter:
@@ -20,11 +30,7 @@ class MetricsWriter:
 
     Args:
       directory: the run's directory.
-      resumed_update: records of later updates are removed first (they come again); None
-      starts afresh.
-      resumed_steps: environment steps done at `resumed_update`, where TensorBoard's
-      curves go on.
-      drop_validation: whether the validation of `resumed_update` comes again, too.
+      continuation: None starts afresh.
       tensorboard: False leaves the event files out.
       on_record: called with each record after it is written.
     """
@@ -32,20 +38,18 @@ class MetricsWriter:
     def __init__(
         self,
         directory: Path,
-        resumed_update: int | None = None,
-        resumed_steps: int = 0,
-        drop_validation: bool = False,
+        continuation: Continuation | None = None,
         tensorboard: bool = True,
         on_record: Callable[[dict], Any] | None = None,
     ):
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
         path = directory / METRICS_FILE
-        if resumed_update is None:
+        if continuation is None:
             path.unlink(missing_ok=True)
             shutil.rmtree(directory / "tensorboard", ignore_errors=True)
         else:
-            truncate_metrics(path, resumed_update, drop_validation)
+            truncate_metrics(path, continuation)
         self._file = open(path, "ab", buffering=0)
         self._on_record = on_record
         self._events = None
@@ -54,7 +58,7 @@ class MetricsWriter:
 
             # has TensorBoard forget what a killed process logged after its last
             # checkpoint
-            purge_step = None if resumed_update is None else resumed_steps + 1
+            purge_step = None if continuation is None else continuation.steps + 1
             self._events = SummaryWriter(
                 str(directory / "tensorboard"), purge_step=purge_step, flush_secs=10
             )
@@ -111,17 +115,16 @@ def read_metrics(path: Path, event: str | None = None) -> Iterator[dict]:
                 yield record
 
 
-def truncate_metrics(path: Path, update: int, drop_validation: bool = False) -> None:
-    """Drop records of updates after `update`, a half-written last line and, if
-    `drop_validation`, the validation of `update`.
-    """
+def truncate_metrics(path: Path, continuation: Continuation) -> None:
+    """Drop the records that come again, and a half-written last line."""
     path = Path(path)
     if not path.exists():
         return
 
     def comes_again(record):
-        is_dropped = drop_validation and record["event"] == "validation"
-        return record["update"] > update or (is_dropped and record["update"] == update)
+        if record["update"] == continuation.update:
+            return continuation.drop_validation and record["event"] == "validation"
+        return record["update"] > continuation.update
 
     with replacing(path) as partial, open(partial, "w", encoding="utf-8") as file:
         for record in read_metrics(path):

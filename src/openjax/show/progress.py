@@ -215,8 +215,9 @@ class Steps(_Display):
         is_told = self._durations.get(step, 0.0) > LONG and (is_other or note != self._note)
         self._note = note
         if is_told and not self._console.is_terminal:
-            left = duration(self.seconds_left(time.monotonic()))
-            self._console.print(Text(f"{self._text()}, about {left} left"), soft_wrap=True)
+            seconds = self.seconds_left(time.monotonic())
+            line = f"{self._text()}, about {duration(seconds)} left"
+            self._console.print(Text(line), soft_wrap=True)
             self._console.file.flush()
 
     def _text(self):

@@ -124,6 +124,13 @@ class Checkpoints:
         records = self.records()
         return records[-1] if records else None
 
+    def reach(self, update: int) -> bool:
+        """Whether the newest committed checkpoint is of this update, or a later one; the same
+        for all processes.
+        """
+        latest = self.latest()
+        return self._processes.of_first(latest is not None and latest.update >= update)
+
     def save(
         self, update: int, carry: Any, score: float | None = None, notes: dict | None = None
     ) -> None:

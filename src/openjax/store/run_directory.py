@@ -119,16 +119,16 @@ def read_config(path: Path, default: TrainSettings) -> TrainSettings:
             changes = changes.get("settings")
     if not isinstance(changes, dict):
         raise UserError(f"{path} holds no settings by name")
-    return from_plain(TrainSettings, _merged(to_plain(default), changes), f"{path}: ")
+    return from_plain(TrainSettings, _merge(to_plain(default), changes), f"{path}: ")
 
 
-def _merged(settings, changes):
+def _merge(settings, changes):
     """Plain settings with others in their place, group by group."""
-    merged = dict(settings)
+    both = dict(settings)
     for name, value in changes.items():
-        is_group = isinstance(value, dict) and isinstance(merged.get(name), dict)
-        merged[name] = _merged(merged[name], value) if is_group else value
-    return merged
+        is_group = isinstance(value, dict) and isinstance(both.get(name), dict)
+        both[name] = _merge(both[name], value) if is_group else value
+    return both
 
 
 def is_run(path: Path) -> bool:
