@@ -17,8 +17,10 @@ from openjax.flights.clocks import (
     read_motor_clock,
 )
 from openjax.flights.flight import Case, Flight
+from openjax.flights.motor_delay import row_torques
 from openjax.flights.track import Track, tracks_of
 from openjax.vehicle import load_vehicle
+from openjax.vehicle.vehicle_numbers import with_values
 
 VEHICLE = load_vehicle()
 
@@ -55,8 +57,25 @@ def slower(track: Track, time: float) -> Track:
     return dataclasses.replace(track, body_rates=rates)
 
 
-def read(tracks, row=0.01, **said):
-    return read_motor_clock(tracks, [VEHICLE] * len(tracks), row, **said)
+def answered(track: Track, time: float) -> Track:
+    """The track as if its motors had another time constant: the body is turned by what
+    they do through it, and by all else as it was.
+    """
+    place = np.asarray(VEHICLE.rotor_position, float)
+    usual, torques = (
+        row_torques(track.motor, place, lag, track.dt)[:-1]
+        for lag in (float(VEHICLE.motor_time_constant), time)
+    )
+    changes = np.diff(track.body_rates[:, :2], axis=0)
+    gain = (usual * changes).sum(0) / (usual**2).sum(0)
+    rates = track.body_rates.copy()
+    rates[1:, :2] += gain * np.cumsum(torques - usual, axis=0)
+    return dataclasses.replace(track, body_rates=rates)
+
+
+def read(tracks, row=0.01, time=None, **said):
+    vehicle = VEHICLE if time is None else with_values(VEHICLE, motor_time_constant=time)
+    return read_motor_clock(tracks, [vehicle] * len(tracks), row, **said)
 
 
 def test_motors_that_act_from_their_row_on_are_no_finding(tracks):
@@ -106,9 +125,20 @@ def test_slow_motors_are_no_clock(tracks, time):
     assert read([slower(t, time) for t in tracks]) == read(tracks)
 
 
-def test_rows_that_hold_what_acted_before_them_are_read_a_row_earlier(tracks):
+@pytest.mark.parametrize("nominal, true", [(0.025, 0.008), (0.057, 0.025), (0.057, 0.008)])
+def test_quick_motors_are_no_clock(tracks, nominal, true):
+    """However slow the simulator's are: they act after their commands all the same."""
+    quick = [answered(t, true) for t in tracks]
+    assert read(quick, time=nominal) == clocks.MotorClock({}, True, {})
+    # a row's shift is one beside them, too
+    shifted = read([moved(t, 0.01) for t in quick], time=nominal)
+    assert shifted.one_clock and list(shifted.findings) == ["motor rows"]
+
+
+@pytest.mark.parametrize("nominal", [0.025, 0.057])
+def test_rows_that_hold_what_acted_before_them_are_read_a_row_earlier(tracks, nominal):
     shifted = [moved(t, 0.01) for t in tracks]
-    found = read(shifted)
+    found = read(shifted, time=nominal)
     assert found.one_clock and list(found.findings) == ["motor rows"]
     for logged, track in zip(tracks, shifted, strict=True):
         back = on_gyroscope_clock(track, found)

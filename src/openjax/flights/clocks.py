@@ -5,8 +5,9 @@ Torques turn the body at once: the angular acceleration that motors would make, 
 their lag, is where the cross-correlation with what the gyroscope reads is largest
 (Knapp, Carter 1976). Roll and pitch tell it: in yaw rotors that speed up turn the body
 before their drag does, which looks like a row's shift. It may come later than the
-motors' lag says, as slow motors and late links do. It can't come earlier: then a row of
-commands holds what acted before it, or the two streams are on different clocks.
+motors' lag says, as slow motors and late links do, and earlier, as quick motors do. It is
+another clock only where no lag explains it: then a row of commands holds what acted before
+it, or the two streams are on different clocks.
 """
 
 import dataclasses
@@ -14,9 +15,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import butter, find_peaks, lfilter, sosfiltfilt
+from scipy.signal import butter, find_peaks, sosfiltfilt
 
 from openjax.flights.flight import Case
+from openjax.flights.motor_delay import lag_and_delay, row_torques
 from openjax.flights.track import (
     GRID_PERIOD,
     MAX_GAP,
@@ -36,10 +38,11 @@ FINER = 4  # steps of an offset in a row of the grid
 LOUD = 3.0  # times the median size, at which the signals are cut
 FOLLOWS = 0.25  # mean squared correlation from which motors and turning belong together
 BETTER = 0.9  # share of it that a peak at another offset may have, and be as good
-# s that motors may seem early: half a row where rows are single samples, and EARLY of a
-# motor that is faster than assumed. The largest in 120 cases of four simulators was
-# .0025 (steps of an offset are as long).
+# s that motors may seem early beside half a row: the largest in 120 cases of four
+# simulators was .0025 (steps of an offset are as long)
 EARLY = 0.003
+REACH_OF_LAGS = 0.1  # s of delay up to which lags are tried beside it
+CLEARLY = 8.0  # nats by which a delay must beat all lags
 # Share of a flight's likeness at its own offset that it has at the common one of all
 # flights, from which it tells no other: where a flight hardly turns the curve is flat.
 TELLS = 0.85
@@ -79,23 +82,56 @@ def read_motor_clock(
     alike = not delays or max(delays.values()) - min(delays.values()) < APART
     # what gusts and wakes turn the loop answers late: flights in them needn't be alike
     times = (usual,) if alike else delays.values()
+    in_time = MotorClock(by_a_row if row_time else {}, True, {})
     if all(-LATE < delay - row_time <= least for delay in times):
-        return MotorClock(by_a_row if row_time else {}, True, {})
-    if alike and not row_time and row >= SLOWEST_ROW and least < usual < 1.5 * row + EARLY:
-        text = (
-            f"motor commands act {1e3 * usual:.0f} ms before their row: rows hold what acted since "
-            "the last one, and are read one row earlier"
+        return in_time
+    if alike:
+        usual = _beyond_lags(
+            tracks, vehicles, gyroscope, usual, (row_time - LATE, row_time + least)
         )
-        return MotorClock(by_a_row, True, {"motor rows": text})
+        if usual is None:
+            return in_time
+        delays = dict.fromkeys(delays, usual)
+        if not row_time and row >= SLOWEST_ROW and least < usual < 1.5 * row + EARLY:
+            text = (
+                f"motor commands act {1e3 * usual:.0f} ms before their row: rows hold what acted "
+                "since the last one, and are read one row earlier"
+            )
+            return MotorClock(by_a_row, True, {"motor rows": text})
+    # what tells no clock has that of the others, where these are alike
+    rest = dict.fromkeys(by_a_row, usual) if alike else {}
+    return MotorClock(rest | delays, False, {"motor clock": _apart(delays, least, gyroscope)})
+
+
+def _apart(delays: dict[str, float], least: float, gyroscope: bool) -> str:
+    """In words that motors are on another clock, and by how much in which flights."""
     words = _in_words({flight: time for flight, time in delays.items() if abs(time) > least})
-    text = (
+    return (
         f"motors and {'gyroscope' if gyroscope else 'attitude'} don't share a clock: motor "
         f"commands are {words}; they are moved by that, and torques, lags and latencies can't be "
         "told from these logs"
     )
-    if alike:  # what tells no clock has that of the others
-        delays = dict.fromkeys(by_a_row, usual) | delays
-    return MotorClock(delays, False, {"motor clock": text})
+
+
+def _beyond_lags(
+    tracks: Sequence[Track], vehicles, gyroscope: bool, offset: float, usual: tuple[float, float]
+) -> float | None:
+    """s by which motor commands are late where no lag of the motors explains that they
+    seem so, by an `offset`; None where one does, with a delay in `usual` limits.
+    """
+    with_motors = [(t, v) for t, v in zip(tracks, vehicles, strict=True) if t.motor is not None]
+    if abs(offset) >= REACH_OF_LAGS or len({t.dt for t, _ in with_motors}) > 1:
+        return offset
+    (first, vehicle), *_ = with_motors
+    lags = lag_and_delay(
+        [(_rates(t, gyroscope), t.motor) for t, _ in with_motors],
+        np.asarray(vehicle.rotor_position, float),
+        first.dt,
+        REACH_OF_LAGS,
+    )
+    if lags is None:
+        return offset
+    return None if lags.against(-usual[1], -usual[0]) < CLEARLY else -lags.delay
 
 
 def _least(row: float, rows: str) -> float:
@@ -241,32 +277,17 @@ def _turning(track: Track, vehicle, gyroscope: bool) -> tuple[Track, np.ndarray,
     """The track, its angular acceleration and that which its motors make, but for their
     units, (T - 1, 2), in roll and pitch.
     """
-    rates = track.body_rates
-    if not gyroscope or rates is None:
-        increments = turn_increments(track.quaternion) / track.dt
-        rates = 0.5 * (
-            np.concatenate([increments[:1], increments])
-            + np.concatenate([increments, increments[-1:]])
-        )
-    acceleration = np.diff(rates[:, :2], axis=0) / track.dt
-    return track, acceleration, _torques(track, vehicle)[:-1]
+    acceleration = np.diff(_rates(track, gyroscope)[:, :2], axis=0) / track.dt
+    lag = float(vehicle.motor_time_constant)
+    torques = row_torques(track.motor, np.asarray(vehicle.rotor_position, float), lag, track.dt)
+    return track, acceleration, torques[:-1]
 
 
-def _torques(track: Track, vehicle) -> np.ndarray:
-    """Torques (T, 2) in roll and pitch, but for their unit, that motors make in each row
-    through their lag: the mean over the row of a first-order answer to a command that is
-    held.
-    """
-    place = np.asarray(vehicle.rotor_position, float)
-    time = float(vehicle.motor_time_constant)
-    decay = np.exp(-track.dt / time)
-    start = decay * track.motor[:1]
-    response = lfilter([1.0 - decay], [1.0, -decay], track.motor, axis=0, zi=start)[0]
-    response_before = np.concatenate([track.motor[:1], response[:-1]])
-    mean = track.motor + (response_before - track.motor) * (1.0 - decay) * time / track.dt
-    # Rotors that differ need unequal commands whenever the thrust changes, and no torque
-    # acts: what goes with the sum tells no time, and in a climb it is all there is.
-    total = mean.sum(1)
-    columns = np.stack([np.ones_like(total), total], 1)
-    torques = mean @ np.stack([place[:, 1], -place[:, 0]], 1)
-    return torques - columns @ np.linalg.lstsq(columns, torques, rcond=None)[0]
+def _rates(track: Track, gyroscope: bool) -> np.ndarray:
+    """Body rates (T, 3), by the gyroscope or by the attitude."""
+    if gyroscope and track.body_rates is not None:
+        return track.body_rates
+    increments = turn_increments(track.quaternion) / track.dt
+    return 0.5 * (
+        np.concatenate([increments[:1], increments]) + np.concatenate([increments, increments[-1:]])
+    )
