@@ -416,7 +416,7 @@ def wrong_layout(change):
         (evaluate, "--policy {run} --json {folder}", "is a folder; a file is needed"),
         (train, "--preset huge", "preset huge: no such preset; there are quick, paper"),
         (train, "--out {run}", "already holds a run; --resume"),
-        (train, "--out {folder}", "holds files that are no run"),
+        (train, "--out {folder}", "holds files that aren't a run's"),
         (train, "--resume {folder}", "is no run"),
         (
             train,

@@ -10,7 +10,7 @@ from openjax.errors import UserError, suggestion
 from openjax.version import __version__
 
 COMMANDS = {
-    "train": "train pursuers, or go on with a run",
+    "train": "train pursuers, or continue a run",
     "evaluate": "fly policies on layouts: captures, collisions, crashes",
     "view": "watch episodes in three dimensions, in a browser or as an HTML file",
     "play": "be the evader, in a browser, against a policy",

@@ -54,7 +54,7 @@ def test_what_a_killed_start_left_is_taken_over_but_nothing_else(tmp_path):
     assert [path.name for path in run.iterdir()] == ["run.lock"]
     (run / "thesis.tex").write_text("")
     for overwrite in (False, True):
-        with pytest.raises(UserError, match="holds files that are no run"):
+        with pytest.raises(UserError, match="holds files that aren't a run's"):
             check_free(run, overwrite)
 
 

@@ -258,7 +258,7 @@ def main(arguments: Sequence[str]) -> None:
     with Steps(f"exporting {options.policy}", STEPS, console) as steps:
         report = export(options, steps.begin)
     difference = report["largest_difference"]
-    comparison = "compared with nothing, as there is no C compiler here"
+    comparison = "not compared with the policy, as there is no C compiler here"
     if difference is not None:
         comparison = f"differs by at most {difference:.1e} on {report['observations']} observations"
     console.print(

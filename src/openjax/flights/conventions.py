@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from openjax.flights.pairs import Signals
 from openjax.flights.track import rotation
 
-RECIPE = "the recipe stands in the page of the log format, under Rows in NED"
+RECIPE = "the recipe is on the page of the log format, under Rows in NED"
 # Both turn back what they turn: half a turn about x, and about the line between north
 # and east.
 DOWN = Rotation.from_quat([1.0, 0.0, 0.0, 0.0])

@@ -31,7 +31,7 @@ class CheckedCache(CacheInterface):
         file = self._path / f"{key}{ENTRY}"
         content = read_checked(file)
         if content is None and file.exists():
-            logging.getLogger(__name__).warning("%s is damaged, and is compiled anew", file)
+            logging.getLogger(__name__).warning("%s is damaged and is compiled again", file)
         return content
 
     def put(self, key: str, value: bytes) -> None:

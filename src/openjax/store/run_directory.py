@@ -170,7 +170,7 @@ def check_free(path: Path, overwrite: bool) -> None:
                 "replaces it"
             )
     elif path.is_dir() and any(not _is_ours(entry.name) for entry in path.iterdir()):
-        raise UserError(f"{path} holds files that are no run; choose another --out")
+        raise UserError(f"{path} holds files that aren't a run's; choose another --out")
 
 
 def create_run(path: Path, overwrite: bool) -> RunDirectory:

@@ -45,7 +45,7 @@ def _jitter_command(parameters, memory, command, context):
 
 COMMAND_JITTER = Effect(
     name="command_jitter",
-    description="each command comes later by a time drawn anew",
+    description="each command comes later by a time drawn for it",
     parameters={
         "longest": Parameter(
             "s",

@@ -127,7 +127,7 @@ def _without_filter(fields: dict[str, str]) -> list[str]:
     if "gyroUnfilt[0]" not in fields:
         raise LogError("no gyroscope was logged (gyroADC[0..2]): switch it on in the blackbox")
     fields |= {f"gyroADC[{i}]": fields[f"gyroUnfilt[{i}]"] for i in range(3)}
-    return ["gyroADC wasn't logged: gyroUnfilt, before Betaflight's filters, stands for it"]
+    return ["gyroADC wasn't logged: gyroUnfilt, before Betaflight's filters, is read instead"]
 
 
 def _usual(fields: dict[str, str], headers: dict[str, str]) -> dict[str, Source]:

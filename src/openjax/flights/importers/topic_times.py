@@ -198,7 +198,7 @@ def _streams(raw, sources, clock_of: dict[str, str], mapping) -> list[Stream]:
         if 1 <= len(rows) < min(4, finite):
             raise LogError(
                 f"{clock} hardly moves ({len(rows)} different of {finite} stamps): a clock that "
-                "stands, or digits that a spreadsheet cut"
+                "stopped, or digits that a spreadsheet cut"
             )
         mine = {sources[c].name for c, k in clock_of.items() if k == clock} & set(raw)
         streams.append(Stream(time[rows], {name: raw[name][rows] for name in mine}))

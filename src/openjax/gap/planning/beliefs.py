@@ -38,7 +38,7 @@ def read_report(folder: Path) -> dict:
     if not isinstance(report, dict) or not {"probabilities", "parameters"} <= set(report):
         if isinstance(report, dict) and "rotors" in report:
             raise UserError(
-                f"{path}: compares trims alone, of which no flight tells more; diagnose flights "
+                f"{path}: compares trims alone, and no flight tells more of them; diagnose flights "
                 "with attitude or gyroscope"
             )
         raise UserError(f"{path}: not a report of openjax diagnose")
