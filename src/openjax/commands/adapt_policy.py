@@ -1,4 +1,4 @@
-"""What `openjax adapt` does: a diagnosis beside the compiler, vehicles drawn from it,
+"""The work of `openjax adapt`: a diagnosis beside the compiler, vehicles drawn from it,
 fine-tuning, figures of both policies.
 """
 
@@ -55,9 +55,7 @@ single episodes.
 
 
 def check(command: AdaptCommand) -> None:
-    """What can be wrong with flights and policy is told before anything is compiled.
-    Raises UserError.
-    """
+    """Raise UserError for anything wrong with flights and policy, before anything is compiled."""
     if isinstance(load_policy(command.policy).policy, Heuristic):
         raise UserError(f"--policy {command.policy}: a heuristic has no networks that could learn")
     (load_case if command.flights.is_dir() else load_effects)(command.flights)
@@ -93,7 +91,7 @@ def adapt(
 
 
 class _Diagnosed(NamedTuple):
-    """What flights said of a vehicle."""
+    """The diagnosis of a vehicle."""
 
     values: dict[str, dict[str, float]]
     family: tuple  # of `VehicleRange`, what vehicles are drawn from
@@ -111,7 +109,7 @@ def _diagnose(effects: Path, airframe: str) -> _Diagnosed:
 def look_of(
     episodes: dict[str, np.ndarray], usual: dict[str, np.ndarray], episode_length: int
 ) -> Look:
-    """What `fine_tune` asks of a policy's figures (B,), by `selection_score`.
+    """The function by which `fine_tune` scores a policy's figures (B,), by `selection_score`.
 
     Speeds over the limit count as far as they are more than in the same `usual` episode,
     that of the policy as it was with the nominal vehicle: to fly as fast with the
@@ -181,7 +179,7 @@ class _Programs:
 
 
 def _results(command, vehicle, rates, tuning) -> dict:
-    """What adapt.json holds, but for the time that it took."""
+    """The content of adapt.json, without the time that it took."""
     parameters = []
     for name, low, high, *_ in vehicle.family:
         effect, _, key = name.partition(".")
@@ -226,8 +224,8 @@ def _write(command, programs, vehicle, tuning, results):
 
 
 def won_back(rates: dict) -> dict[str, float | None]:
-    """Of each loss, before against nominal, the share that is none any more after; None
-    where there was none beyond chance.
+    """For each loss (before against nominal), the share that is won back after; None if there was
+    none beyond chance.
 
     Args:
       rates: {"nominal", "before", "after": figures (B,) of the same episodes}.

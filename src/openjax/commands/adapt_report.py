@@ -1,4 +1,4 @@
-"""What adapting found and gained: in lines for a terminal, and as a page."""
+"""The report of `openjax adapt`: in lines for a terminal, and as a page."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ the adapted policy's with that one.
 
 
 def in_words(results: dict) -> list[str]:
-    """What was found and gained."""
+    """The findings and the gain, in words."""
     effects = (
         ", ".join(results["effects"]) or "no effect: the simulator is right to within the noise"
     )

@@ -67,7 +67,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _default(arguments) -> BenchmarkCommand:
-    """What is measured where nobody says: what fits the machine."""
+    """The default of what is measured: what fits the machine."""
     # help needn't wait for JAX
     on_cpu = bool({"-h", "--help"} & set(arguments))
     if not on_cpu:

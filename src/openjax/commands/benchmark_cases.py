@@ -1,5 +1,5 @@
-"""What `openjax benchmark` times, and how: physics, environment, rollout and the
-training step, each as one function.
+"""The cases of `openjax benchmark`: physics, environment, rollout and the training step, each as
+one function.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 
 
 class Case(NamedTuple):
-    """What is timed."""
+    """A case to be timed."""
 
     name: str
     num_envs: int

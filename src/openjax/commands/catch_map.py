@@ -1,6 +1,6 @@
-"""What `openjax map` does: a policy flies with teams of each size, after evaders of
-each speed, with each capture radius; how many episodes of each cell end with a capture,
-and what a theorem forces.
+"""The work of `openjax map`: a policy flies with teams of each size, after evaders of each speed,
+with each capture radius. It counts how many episodes of each cell end with a capture, beside what a
+theorem forces.
 """
 
 import dataclasses

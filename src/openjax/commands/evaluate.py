@@ -35,7 +35,7 @@ LARGEST_BATCH = 1000
 
 @dataclasses.dataclass(frozen=True)
 class FlightOptions:
-    """What is flown: policies on layouts, against an evader."""
+    """The flights of a command: policies on layouts, against an evader."""
 
     policy: tuple[str, ...] | None = None
     """Runs' directories, policy files (.npz), checkpoints, or names of policies in the
@@ -89,8 +89,7 @@ class FlightOptions:
         return [load_policy(name) for name in names]
 
     def pursuers_of(self, environment: PursuitSettings) -> int:
-        """How many pursuers are asked for: those of a layout's file, or of the
-        settings.
+        """The number of pursuers asked for: that of a layout's file, or of the settings.
 
         Raises:
           UserError: an unusable file.

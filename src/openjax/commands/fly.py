@@ -162,7 +162,7 @@ def _next(outcome) -> str:
 
 
 class Prepared(NamedTuple):
-    """What is to be flown, and with what."""
+    """A prepared flight."""
 
     game: object
     state: object  # of the safety, before the flight
@@ -257,7 +257,7 @@ def _longest_flight(arguments: Arguments, settings) -> float:
 
 
 def _remarks(arguments: Arguments, settings, vehicle, seconds: float) -> tuple[str, ...]:
-    """What somebody should know before the vehicles rise."""
+    """Remarks to read before the vehicles rise."""
     remarks = _time_remark(arguments, seconds)
     if vehicle.airframe == settings.airframe:
         return remarks

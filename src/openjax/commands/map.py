@@ -1,4 +1,4 @@
-"""What a policy catches: `openjax map --policy RUN`.
+"""Show what a policy catches: `openjax map --policy RUN`.
 
 It flies with teams of each size, after evaders of each speed, with each capture radius:
 after scripted evaders, after some that learned to escape from this policy, and, in some

@@ -148,7 +148,7 @@ class MapEvaders:
         save_policy_file(path, content, {"environment": self.game}, notes, storage="float32")
 
     def load(self, path: Path) -> tuple[Evaders, list[dict]]:
-        """What `save` wrote; they can fly, not learn on.
+        """Load what `save` wrote; the evaders can fly, not learn on.
 
         Raises:
           UserError: no such file, or one of other evaders.

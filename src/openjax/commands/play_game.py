@@ -110,7 +110,7 @@ class PersonsGame:
 
     @property
     def is_capture(self) -> bool:
-        """Whether the last step was a capture."""
+        """True if the last step was a capture."""
         return bool(self.moments) and bool(self.moments[-1].capture.any())
 
     @property

@@ -26,8 +26,8 @@ LONGEST_WISH = 200
 
 
 class Table:
-    """Where games are played one after the other: the threads of the page and of the
-    game meet here.
+    """The place where games are played one after the other: the threads of the page and of the game
+    meet here.
 
     Args:
       begin: a new game, of a number that is counted up.
@@ -85,8 +85,8 @@ class Table:
         self.longest = max(self.longest, game.seconds)
 
     def events(self) -> Iterator[dict | None]:
-        """What a page is told, for as long as it listens: each game's start, its frames
-        and its end. None says that nothing has happened for a while.
+        """The events for a page, for as long as it listens: each game's start, its frames and its
+        end. None means that nothing has happened for a while.
         """
         listener = _Listener(self._every)
         while True:
@@ -121,12 +121,12 @@ class _Listener:
         self.knows_end = False
 
     def is_behind(self, game: PersonsGame) -> bool:
-        """Whether there is something to tell."""
+        """True if there are events that the page hasn't got."""
         is_over = game.over and not self.knows_end
         return game is not self.game or len(game.moments) >= self.sent + self.every or is_over
 
     def catch_up(self, game: PersonsGame) -> list:
-        """What there is to tell, which counts as told."""
+        """The events that the page hasn't got, which count as sent."""
         events: list = []
         if game is not self.game:
             self.game = game
@@ -202,7 +202,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(400)
 
     def _is_ours(self):
-        """Whether this machine's own page asks, by its host's name and its origin."""
+        """True if this machine's own page asks, by its host's name and its origin."""
         host = self.headers.get("Host", "")
         origin = self.headers.get("Origin", f"http://{host}")
         return host.rpartition(":")[0] in OWN_NAMES and origin == f"http://{host}"

@@ -140,8 +140,8 @@ def compile_last_stage(job: TrainingJob, policy: PolicyParameters) -> Callable |
 
 
 def _number_of_devices(policy, worlds):
-    """How many devices share worlds whose policy lies on some of this process; 1 where
-    they can't.
+    """The number of devices that share worlds whose policy lies on some of this process; 1 if they
+    can't.
     """
     places = {getattr(leaf, "sharding", None) for leaf in jax.tree.leaves(policy)} - {None}
     number = max((len(at.device_set) for at in places if at.is_fully_addressable), default=1)

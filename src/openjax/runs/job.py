@@ -1,5 +1,5 @@
-"""What a training run is made of: what was asked for, the parts that learn, where they
-start. `openjax.runs.training` goes about it.
+"""A training run: settings, own parts, where it starts and how long it may last.
+`openjax.runs.training` runs it.
 """
 
 import dataclasses
@@ -49,16 +49,14 @@ class OwnParts:
 
     @property
     def names(self) -> list[str]:
-        """The parts that there are: a run that was begun with them goes on with the same
-        ones only.
-        """
+        """The names of own parts: a run that began with them continues with the same ones only."""
         parts = [name for name in ("environment", "policy", "learners") if getattr(self, name)]
         return parts + [f"learner {name}" for name in self.learners or ()]
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainingJob:
-    """What to train and how to go about it; complete, and checked by `check_job`."""
+    """The training to do, and its conditions."""
 
     command: TrainCommand
     """What was asked for, with what the machine or a resumed run adds to it."""

@@ -40,7 +40,7 @@ class NotFiniteError(Stopped):
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What a run is to do."""
+    """The plan of a run."""
 
     total_updates: int
     steps_per_update: int
@@ -75,7 +75,7 @@ class _Update(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """How a run ended."""
+    """The end of a run."""
 
     carry: Any
     update: int

@@ -1,4 +1,4 @@
-"""What a result was measured on: devices, versions, commit."""
+"""The machine that a result was measured on: devices, versions, commit."""
 
 import os
 import platform

@@ -1,5 +1,5 @@
-"""What `openjax train` was asked for, checked, and the start of a run: everything
-before the first array.
+"""The request to `openjax train`, checked, and the start of a run: everything before the first
+array.
 """
 
 import contextlib
@@ -153,8 +153,8 @@ def prepare(
     processes: Processes,
     own_parts: OwnParts | None = None,
 ) -> tuple[TrainingJob, RunDirectory, dict[str, Path]]:
-    """What to train, where, and the files to copy there, by their names; nothing is
-    changed yet. Arguments as of `start`.
+    """The training, its directory, and the files to copy there, by their names; nothing is changed
+    yet. Arguments as of `start`.
 
     Raises:
       UserError: whatever can be wrong with the files or the settings.
@@ -237,8 +237,8 @@ def _environment(game, files):
 
 
 def other_compiler(facts: dict) -> str | None:
-    """What to say of a run whose last process, by its facts, had another JAX than this
-    one; None where it had the same, or nobody noted it.
+    """A remark for a run whose last process, by its facts, had another JAX than this one; None if
+    it had the same, or the facts don't say.
     """
     machine = facts.get("machine")
     versions = machine.get("versions") if isinstance(machine, dict) else None

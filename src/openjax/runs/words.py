@@ -1,5 +1,5 @@
-"""What a run says in words: what is trained, and at its end what a crash is, what isn't
-the paper's, and what to type next.
+"""A run's words: its training, and at its end the meaning of a crash, differences from the paper,
+and the next commands.
 """
 
 from pathlib import Path
@@ -121,8 +121,8 @@ def _instead(what, value, usual):
 
 
 def unlike_the_papers(game: PursuitSettings, evaders: tuple[str, ...]) -> str:
-    """How a game differs from the paper's, as a sentence; empty where it doesn't.
-    `evaders`: names or files of those who fly, its own or others.
+    """A sentence on a game's differences from the paper's; empty if there are none. `evaders`:
+    names or files of those who fly, its own or others.
     """
     paper = PursuitSettings()
     words = []
