@@ -91,11 +91,13 @@ def _dataclass_from_plain(kind, value, place):
     fields = {field.name: field for field in dataclasses.fields(kind) if field.init}
     root = place.removesuffix(ROOT)
     entries = _table(value, place)
-    for key in entries:
-        if key not in fields:
+    unknown = [key for key in entries if key not in fields]
+    for key in unknown:
+        if not _was_setting(kind, key, entries, place):
             raise UserError(
                 f"{root} has the unknown key {shown(key)}; {suggestion(str(key), sorted(fields))}"
             )
+    entries = {key: entry for key, entry in entries.items() if key in fields}
     for name, field in fields.items():
         has_no_default = field.default is field.default_factory is dataclasses.MISSING
         if has_no_default and name not in entries:
@@ -108,6 +110,30 @@ def _dataclass_from_plain(kind, value, place):
     # once more, though most kinds check themselves: here the error names the file
     check_intervals(instance, _place(place, ""))
     return instance
+
+
+def _was_setting(kind, key, entries, place):
+    """Whether earlier versions had this setting, which is a constant of the class now: of the
+    same name in capitals, or in its `FORMER` where the code doesn't need it.
+
+    Raises:
+      UserError: it has another value, in a part that isn't switched off (`SWITCH` names the
+      setting that does it by 0).
+    """
+    constants = {name.lower(): value for name, value in vars(kind).items() if name.isupper()}
+    constants |= constants.pop("former", {})
+    switch = constants.pop("switch", None)
+    if key not in constants:
+        return False
+    constant = constants[key]
+    is_off = switch is not None and entries.get(switch) == 0
+    value = entries[key]
+    if not is_off and (isinstance(value, bool) != isinstance(constant, bool) or value != constant):
+        raise UserError(
+            f"{_place(place, key)} is {shown(value)}; it was a setting once, and is always "
+            f"{constant} now"
+        )
+    return True
 
 
 def _union_from_plain(arguments, value, place):

@@ -1,7 +1,5 @@
 """Actor, critic and predictor as a user of the policy sees them."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -197,10 +195,8 @@ def test_density_and_entropy():
     )
 
 
-@pytest.mark.parametrize("relative", [True, False])
-def test_predictor_is_an_lstm_whose_range_is_the_arena(relative):
-    settings = dataclasses.replace(POLICY.predictor, relative=relative)
-    predictor = EvaderPredictor(settings, arena_radius=0.9, arena_height=1.2)
+def test_predictor_is_an_lstm_whose_range_is_the_arena():
+    predictor = EvaderPredictor(POLICY.predictor, arena_radius=0.9, arena_height=1.2)
     observation = observation_of(6)
     seen = observation.frames, observation.last_seen
     predicted, parameters = jax.jit(predictor.init_with_output)(jax.random.key(0), *seen)
@@ -218,10 +214,8 @@ def test_predictor_is_an_lstm_whose_range_is_the_arena(relative):
         hidden = sigmoid(leave) * np.tanh(cell)
     output = (hidden @ p["output"]["kernel"] + p["output"]["bias"]).reshape(BATCH, 2, 3)
     scale = np.array([0.9, 0.9, 0.6])
-    start = np.asarray(observation.last_seen)[:, None] if relative else np.array([0, 0, 0.6])
-    np.testing.assert_allclose(
-        predicted, start + (0.1 if relative else 1.0) * scale * output, atol=1e-4
-    )
+    start = np.asarray(observation.last_seen)[:, None]
+    np.testing.assert_allclose(predicted, start + 0.1 * scale * output, atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -48,13 +48,13 @@ class MappoSettings:
     """Of the reward, per control step."""
     gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
     """Lambda of the generalised advantage estimate."""
-    max_grad_norm: Annotated[float, Interval("(0, 1e6]")] = 10.0
+    MAX_GRAD_NORM = 10.0
     """Global norm to which gradients are cut, actor and critic each."""
-    huber: Annotated[float, Interval("(0, 1e6]")] = 10.0
+    HUBER = 10.0
     """Where the value loss turns linear, in standard deviations of the returns."""
-    value_coefficient: Annotated[float, Interval("(0, 1000]")] = 1.0
+    VALUE_COEFFICIENT = 1.0
     """Weight of the value loss; it matters where actor and critic share an encoder."""
-    value_norm_decay: Annotated[float, Interval("[0, 1)")] = 0.95
+    VALUE_NORM_DECAY = 0.95
     """Share of the old mean and variance of the returns that value normalisation keeps
     per iteration.
     """

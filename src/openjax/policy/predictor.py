@@ -40,16 +40,12 @@ class EvaderPredictor(nn.Module):
             forget = jax.nn.sigmoid(forget_gate + 1.0) * cell
             cell = forget + jax.nn.sigmoid(in_gate) * jnp.tanh(candidate)
             state = jax.nn.sigmoid(out_gate) * jnp.tanh(cell)
-        # small, so that a fresh predictor says what it is relative to: where the evader
-        # was last seen, or the arena's middle
+        # small, so that a fresh predictor says where the evader was last seen
         initial = nn.initializers.orthogonal(0.1)
         output = nn.Dense(3 * len(horizons), kernel_init=initial, name="output")(state)
         output = output.reshape(*output.shape[:-1], len(horizons), 3)
         scale = jnp.array(
             [self.arena_radius, self.arena_radius, self.arena_height / 2], jnp.float32
         )
-        if self.settings.relative:
-            # within a horizon the evader moves a tenth of the arena or so: outputs of
-            # one order
-            return last_seen[..., None, :] + 0.1 * scale * output
-        return jnp.array([0.0, 0.0, self.arena_height / 2], jnp.float32) + scale * output
+        # within a horizon the evader moves a tenth of the arena or so: outputs of one order
+        return last_seen[..., None, :] + 0.1 * scale * output

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Annotated, Literal
 
 from openjax.errors import UserError
@@ -68,23 +69,17 @@ class PredictorSettings:
     """Control steps ahead at which positions are predicted; the first is 1. The paper's
     are 1 to 5.
     """
-    relative: bool = True
-    """Predict the displacement from where the evader was last seen; False: positions in
-    the arena, as in the paper.
-    """
-    loss: Literal["scaled", "squared"] = "scaled"
-    """Mean squared error. "scaled": in units of how far the evader flies in that time,
-    without the windows that end before it was first seen; "squared": in metres, of all
-    windows, as in the paper.
-    """
     learning_rate: Annotated[float, Interval("(0, 1]")] = 1e-3
-    """Adam step size; 1e-4 in the paper."""
-    decay: bool = True
-    """Let the step size fall linearly to zero over `total_steps`; the paper's stays."""
+    """Adam step size at the start; falls linearly to zero over `total_steps`. The paper's
+    stays at 1e-4.
+    """
     windows: Annotated[int, Interval("[1, 1000]")] = 8
     """Windows of each environment's rollout that one iteration trains on."""
     steps: Annotated[int, Interval("[1, 1000]")] = 4
     """Gradient steps per iteration, over disjoint windows."""
+
+    FORMER = MappingProxyType({"relative": True, "loss": "scaled", "decay": True})
+    """Settings that earlier versions had, and their only value now."""
 
     def __post_init__(self):
         check_intervals(self, "predictor.")

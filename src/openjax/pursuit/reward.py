@@ -22,7 +22,7 @@ from openjax.pursuit.collisions import breaches, crashed
 from openjax.pursuit.info import StepInfo
 from openjax.pursuit.settings import PursuitSettings, RewardSettings
 from openjax.pursuit.shapes import Active, Each, Flag, Pillars, Scalar, Team, Vector, Which
-from openjax.pursuit.shortest_paths import evader_territory, path_length
+from openjax.pursuit.shortest_paths import path_length
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.teams import of_team
 from openjax.vehicle.vectors import length
@@ -152,9 +152,7 @@ def default_reward(weights: RewardSettings) -> tuple[Term, ...]:
     terms = (
         Term(captured, weights.capture),
         Term(evader_distance, -weights.distance),
-        Term(nearest_distance, -weights.nearest),
         Term(evader_path, -weights.path),
-        Term(territory, -weights.territory),
         Term(unseen, -weights.unseen),
         Term(first_capture, weights.first_capture),
         Term(recapture, weights.recapture),
@@ -170,13 +168,6 @@ def default_reward(weights: RewardSettings) -> tuple[Term, ...]:
 def captured(transition: Transition) -> Flag:
     """() whether any pursuer has the evader."""
     return jnp.any(transition.info.captured)
-
-
-def nearest_distance(transition: Transition) -> Scalar:
-    """() m from the evader to the pursuer that is nearest to it."""
-    distance = evader_distance(transition)
-    active = transition.state.active
-    return jnp.min(distance if active is None else jnp.where(active, distance, jnp.inf))
 
 
 def first_capture(transition: Transition) -> Flag:
@@ -195,17 +186,6 @@ def evader_path(transition: Transition) -> Each:
     state = transition.state
     position = state.drones.position
     return path_length(
-        transition.settings, state.task, state.paths, position, state.evader_position
-    )
-
-
-def territory(transition: Transition) -> Scalar:
-    """() share of the arena that the evader can be at before any pursuer has it in
-    reach.
-    """
-    state = transition.state
-    position = state.drones.position
-    return evader_territory(
         transition.settings, state.task, state.paths, position, state.evader_position
     )
 

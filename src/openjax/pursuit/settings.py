@@ -2,6 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Annotated, Literal
 
 from openjax.errors import UserError
@@ -48,19 +49,10 @@ class RewardSettings:
     """
     distance: Annotated[float, Interval("[0, 1e6]")] = 0.1
     """Subtracted per metre between pursuer and evader."""
-    nearest: Annotated[float, Interval("[0, 1e6]")] = 0.0
-    """Subtracted, of all pursuers, per metre between the evader and the nearest of
-    them: who isn't the nearest loses nothing by going round (not in the paper).
-    """
     path: Annotated[float, Interval("[0, 1e6]")] = 0.0
     """Subtracted per metre of the shortest path round the pillars between pursuer and
     evader: who minds the straight line alone waits behind a wall, opposite to the
     evader (not in the paper).
-    """
-    territory: Annotated[float, Interval("[0, 1e6]")] = 0.0
-    """Subtracted, of all pursuers, times the share of the arena that the evader can be
-    at before any of them: who comes from the other side takes some of it away (not in
-    the paper).
     """
     unseen: Annotated[float, Interval("[0, 1e6]")] = 0.0
     """Subtracted, of all pursuers, in each step in which nobody sees the evader: in a
@@ -91,13 +83,16 @@ class RewardSettings:
     velocities (s; not in the paper).
     """
 
+    FORMER = MappingProxyType({"nearest": 0.0, "territory": 0.0})
+    """Terms that earlier versions had, and their only weight now."""
+
     def __post_init__(self):
         check_intervals(self, "environment.reward.")
 
     @property
     def needs_paths(self) -> bool:
         """True if worlds have to know the shortest paths round their pillars."""
-        return self.path != 0.0 or self.territory != 0.0
+        return self.path != 0.0
 
 
 @dataclass(frozen=True)
@@ -155,10 +150,6 @@ class PursuitSettings:
     """Angle (degrees) by which the cone opens about a pursuer's body x axis in which it
     sees the evader, if no pillar is between (not in the paper). It limits neither
     captures nor what the evader sees.
-    """
-    evader_norm: Literal["euclidean", "axis"] = "euclidean"
-    """How the evader's force becomes a velocity; "axis" normalises by the largest
-    component (up to 3**0.5 faster).
     """
     evaders: tuple[str, ...] = ("field",)
     """Evaders, one of which is drawn for each episode with equal odds; a name that
@@ -256,6 +247,9 @@ class PursuitSettings:
     "pooled": where the nearest one is and whence all press, for teams of any size.
     """
     reward: RewardSettings = field(default_factory=RewardSettings)
+
+    FORMER = MappingProxyType({"evader_norm": "euclidean"})
+    """Settings that earlier versions had, and their only value now."""
 
     def __post_init__(self):
         check_intervals(self, "environment.")

@@ -108,7 +108,7 @@ def make_optimiser(
     def late(count):
         return jnp.where(count < settings.actor_start * steps, 0.0, schedule(count))
 
-    max_norm = settings.max_grad_norm
+    max_norm = settings.MAX_GRAD_NORM
     # the critic isn't held back: with `actor_start` it is what learns first
     actor_rate = late if settings.actor_start else schedule
     # behind Adam, which would scale a scaled gradient up again
@@ -139,8 +139,8 @@ def loss(
     objective = Objective(
         mean=functools.partial(team_mean, observation.active),
         clip=clip,
-        value_error=functools.partial(optax.huber_loss, delta=settings.huber),
-        value_coefficient=settings.value_coefficient,
+        value_error=functools.partial(optax.huber_loss, delta=settings.HUBER),
+        value_coefficient=settings.VALUE_COEFFICIENT,
     )
     total, terms = objective.loss(answer, samples)
     return total, objective.watch(terms) | {"entropy": entropy}
@@ -251,7 +251,7 @@ class Mappo:
 
     def _new_scale(self, scale, returns, experience):
         """The running moments after these returns."""
-        decay = self.settings.value_norm_decay
+        decay = self.settings.VALUE_NORM_DECAY
         active = experience.rollout.observation.active
         mean, square = experience.mean((team_mean(active, returns), team_mean(active, returns**2)))
         return ValueScale(

@@ -24,9 +24,8 @@ def make_predictor_optimiser(
     settings: PredictorSettings, total_updates: int
 ) -> optax.GradientTransformation:
     """Adam, with gradients cut at norm 1."""
-    step_size = settings.learning_rate
-    if settings.decay:
-        step_size = optax.linear_schedule(step_size, 0.0, total_updates * settings.steps)
+    steps = total_updates * settings.steps
+    step_size = optax.linear_schedule(settings.learning_rate, 0.0, steps)
     return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(step_size))
 
 
@@ -87,8 +86,6 @@ def prediction_loss(
     learnt from them is carried over to where it is lost from sight.
     """
     error = predictions - positions
-    if settings.loss == "squared":
-        return jnp.mean(error**2)
     # in units of the distance that the evader flies within each horizon, all horizons
     # weigh alike
     is_flown = game.evader_speed * game.time_step * jnp.array(settings.horizons, jnp.float32)

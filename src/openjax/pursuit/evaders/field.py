@@ -54,11 +54,7 @@ def field_velocity(
     # pillars and wall push on the level alone, ceiling and floor upright
     force = force + jnp.concatenate([wall + pillars, (floor - ceiling)[None]])
     # the field says where to, never how fast
-    if settings.evader_norm == "axis":
-        size = jnp.max(jnp.abs(force))
-    else:
-        size = length(force)
-    return settings.evader_speed * force / (size + EPSILON)
+    return settings.evader_speed * force / (length(force) + EPSILON)
 
 
 def _norm_squared(vector: jax.Array) -> jax.Array:
