@@ -1,5 +1,5 @@
-"""A policy that observes a longer history than it was trained with does what it did,
-until it learns.
+"""A policy that observes more than it was trained with does what it did, until it
+learns.
 """
 
 import dataclasses
@@ -11,16 +11,28 @@ import pytest
 
 import openjax
 from openjax.policy import NetworkSettings, Policy, PolicyParameters, PredictorSettings
-from openjax.policy.growth import with_longer_history
+from openjax.policy.growth import in_larger_game
 from openjax.pursuit import Pursuit, PursuitSettings
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize("frames, predicts", [(0, True), (2, False)])
-def test_the_grown_policy_acts_alike(frames, predicts):
-    old = PursuitSettings(physics="rigid", observe_position=True, observe_history=frames)
-    new = dataclasses.replace(old, observe_history=3)
+@pytest.mark.parametrize(
+    "frames, predicts, pursuers", [(0, True, "pooled"), (2, False, "each"), (0, True, "each")]
+)
+def test_the_grown_policy_acts_alike(frames, predicts, pursuers):
+    old = PursuitSettings(
+        physics="rigid", observe_position=True, observe_history=frames, history_pursuers=pursuers
+    )
+    new = dataclasses.replace(
+        old,
+        observe_history=3,
+        observe_game=True,
+        observe_arena=True,
+        team_code=1,
+        own_code=2,
+        history_pursuers="both",
+    )
     network = NetworkSettings(features=8, heads=2)
     predictor = PredictorSettings(enabled=predicts, units=4)
     worlds = [Pursuit(settings) for settings in (old, new)]
@@ -39,7 +51,11 @@ def test_the_grown_policy_acts_alike(frames, predicts):
         parameters = policies[0].init(key, observations[0])
         actor = jax.tree.map(lambda x: x + 0.3 * jax.random.normal(key, x.shape), parameters.actor)
         parameters = parameters.replace(actor=actor)
-        grown = with_longer_history(parameters, predictor, old, new)
+        if predicts:
+            guesses = parameters.predictor
+            noise = jax.tree.map(lambda x: 0.3 * jax.random.normal(key, x.shape), guesses)
+            parameters = parameters.replace(predictor=jax.tree.map(jnp.add, guesses, noise))
+        grown = in_larger_game(parameters, predictor, old, new)
         return policies[0].act(parameters, observations[0]), policies[1].act(grown, observations[1])
 
     before, after = both(jax.random.key(0))
@@ -50,13 +66,13 @@ def test_the_grown_policy_acts_alike(frames, predicts):
 def test_a_policy_of_the_same_history_is_left_alone():
     settings = PursuitSettings()
     parameters = PolicyParameters(actor={}, critic={}, predictor={})
-    assert with_longer_history(parameters, PredictorSettings(), settings, settings) is parameters
+    assert in_larger_game(parameters, PredictorSettings(), settings, settings) is parameters
 
 
 def test_a_policy_without_networks_is_refused():
     heuristic = openjax.load_policy("apf")
     longer = dataclasses.replace(heuristic.settings.environment, observe_history=12)
     with pytest.raises(openjax.UserError, match="no networks"):
-        with_longer_history(
+        in_larger_game(
             heuristic.parameters, PredictorSettings(), heuristic.settings.environment, longer
         )

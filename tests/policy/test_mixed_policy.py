@@ -10,9 +10,10 @@ import pytest
 import openjax
 from openjax.errors import UserError
 from openjax.evaluation.judges.planner import without_foresight
-from openjax.policy import MixedPolicy, mixed_parameters
+from openjax.policy import MixedPolicy, SortedPolicy, mixed_parameters
 from openjax.pursuit import Pursuit, PursuitSettings
-from openjax.store.mixed_policies import member, mixed_policy
+from openjax.pursuit.teams import drawn_codes, drawn_strategy
+from openjax.store.mixed_policies import Draws, member, mixed_policy
 from tests.policy.parameters import random_parameters
 from tests.policy.test_policy import POLICY, observation_of
 
@@ -64,16 +65,55 @@ def test_a_team_flies_its_draws_one_after_another_and_starts_as_without_them(wor
     game = Pursuit(GAME)
     keys, observation, state = worlds
     assert state.strategies.shape == (300, 4)
-    share = np.bincount(np.asarray(state.strategies).ravel()) / state.strategies.size
-    np.testing.assert_allclose(share, 1 / 3, atol=0.05)
+    share = np.bincount((3 * np.asarray(state.strategies)).astype(int).ravel())
+    np.testing.assert_allclose(share / state.strategies.size, 1 / 3, atol=0.05)
     observed = jax.jit(jax.vmap(lambda state: game.observe(state).strategy))
     for step, draw in ((0, 0), (24, 0), (25, 1), (99, 3), (100, 3)):
         there = state.replace(step=jnp.full_like(state.step, step))
-        np.testing.assert_array_equal(observed(there), state.strategies[:, draw])
+        drawn = (3 * np.asarray(state.strategies[:, draw])).astype(int)
+        np.testing.assert_array_equal(observed(there), drawn)
     plain = Pursuit(dataclasses.replace(GAME, strategies=1))
     usual, _ = jax.jit(jax.vmap(plain.reset))(keys)
     assert usual.strategy is None
     np.testing.assert_array_equal(usual.self_state, observation.self_state)
+
+
+def test_a_team_draws_by_its_odds_and_by_others_while_nobody_sees_the_evader():
+    game = dataclasses.replace(
+        GAME, strategy_odds=(1.0, 0.0, 3.0), strategy_odds_unseen=(0.0, 2.0, 0.0)
+    )
+    draws = jnp.linspace(0.0, 0.999, 400)
+    for seen, shares in ((True, (0.25, 0.0, 0.75)), (False, (0.0, 1.0, 0.0))):
+        drawn = drawn_strategy(game, draws, jnp.full(400, seen))
+        np.testing.assert_allclose(np.bincount(drawn, minlength=3) / 400, shares, atol=0.01)
+
+
+def test_worlds_sorted_by_what_they_fly_act_as_unsorted(members):
+    """Also where copies of a world draw together, which leaves one member with far more
+    worlds than it flies in the mean.
+    """
+    parameters = mixed_parameters(members)
+    unsorted = MixedPolicy(POLICY, 3)
+    for copies in (1, 16):
+        drawn = np.repeat(np.random.default_rng(1).integers(0, 3, 64 // copies), copies)
+        observation = observation_of(5)
+        observation = jax.tree.map(
+            lambda leaf: jnp.resize(leaf, (64, *leaf.shape[1:])), observation
+        )
+        observation = observation.replace(strategy=jnp.asarray(drawn))
+        by_member = SortedPolicy.of(unsorted, GAME, copies)
+        actions = [jax.jit(policy.act)(parameters, observation) for policy in (unsorted, by_member)]
+        np.testing.assert_allclose(*actions, atol=1e-5)
+
+
+def test_codes_are_the_teams_and_each_pursuers_own_and_change_with_the_draws():
+    game = dataclasses.replace(GAME, strategies=1, team_code=2, own_code=1)
+    assert game.draws and not dataclasses.replace(game, team_code=0, own_code=0).draws
+    codes = jax.vmap(lambda draw: drawn_codes(game, draw))(jnp.linspace(0.0, 1.0, 500))
+    np.testing.assert_array_equal(codes[:, 0, :2], codes[:, 2, :2])
+    numbers = jnp.concatenate([codes[:, 0, :2], codes[:, :, 2]], axis=1)
+    np.testing.assert_allclose(jnp.corrcoef(numbers.T), np.eye(5), atol=0.2)
+    assert float(numbers.min()) >= -1.0 and float(numbers.std()) == pytest.approx(3**-0.5, 0.1)
 
 
 def test_an_evader_that_plans_knows_who_flies_and_not_who_comes_next(worlds):
@@ -82,19 +122,21 @@ def test_an_evader_that_plans_knows_who_flies_and_not_who_comes_next(worlds):
     _, planned = without_foresight(GAME, (observation, state), jax.random.key(3))
     same = np.mean(np.asarray(planned.strategies == state.strategies), axis=0)
     np.testing.assert_array_equal(same[:2], 1.0)
-    np.testing.assert_allclose(same[2:], 1 / 3, atol=0.1)
+    np.testing.assert_allclose(same[2:], 0.0, atol=0.01)
 
 
 def test_a_mixed_policy_gives_back_its_members_and_takes_no_others():
     evaders = openjax.load_policy("evaders")
     first, second = member(evaders, 0), member(evaders, 1)
-    again = mixed_policy([first, second], 0.4)
+    again = mixed_policy([first, second], Draws())
     assert again.settings == evaders.settings
     jax.tree.map(np.testing.assert_array_equal, again.parameters, evaders.parameters)
-    with pytest.raises(UserError, match="draws already; name its members"):
-        mixed_policy([evaders, first], 0.4)
+    more = mixed_policy([evaders, first], Draws(odds=(1.0, 0.0, 3.0)))
+    assert more.policy.number == 3 and more.settings.environment.strategy_odds == (1.0, 0.0, 3.0)
+    with pytest.raises(UserError, match="one number for each of the 2 strategies"):
+        mixed_policy([first, second], Draws(odds=(1.0,)))
     with pytest.raises(UserError, match="evaders, member 0 and open differ in network"):
-        mixed_policy([first, openjax.load_policy("open")], 0.4)
+        mixed_policy([first, openjax.load_policy("open")], Draws())
     with pytest.raises(UserError, match="here nothing is drawn; make its game"):
         game = Pursuit(first.settings.environment)
         evaders(jax.eval_shape(game.reset, jax.random.key(0))[0])

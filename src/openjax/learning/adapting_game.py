@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from openjax.learning.settings import TrainSettings
 from openjax.policy import PolicyParameters
-from openjax.policy.growth import with_longer_history
+from openjax.policy.growth import in_larger_game
 from openjax.pursuit import PursuitSettings, RewardSettings
 from openjax.vehicle.family import REST, adapted_family, family_bounds
 from openjax.vehicle.parameters import NOMINAL
@@ -47,7 +47,7 @@ def starting_parameters(parameters: PolicyParameters, settings: TrainSettings) -
     game = settings.environment
 
     def longer(one):
-        return with_longer_history(one, settings.predictor, game, adapting_game(game))
+        return in_larger_game(one, settings.predictor, game, adapting_game(game))
 
     start = parameters.replace(critic={})
     # the members of a team that draws stand side by side

@@ -440,7 +440,9 @@ class TrainSettings:
             "attention would be right",
         )
         yield (
-            not sizes or not self.predictor.enabled or self.environment.history_pursuers != "each",
+            not sizes
+            or not self.predictor.enabled
+            or self.environment.history_pursuers == "pooled",
             "predictor: frames of each pursuer are for teams of one size; "
             "environment.history_pursuers pooled would be right",
         )

@@ -1,9 +1,8 @@
-"""A policy for a game in which it observes more of its own history: the same policy
-until it learns to use it.
+"""A policy for a game in which it observes more: the same policy until it learns to use
+it.
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax.numpy as jnp
 
@@ -13,42 +12,103 @@ from openjax.policy.settings import PredictorSettings
 from openjax.pursuit.settings import OWN_FRAME, PursuitSettings
 
 
-def with_longer_history(
+def in_larger_game(
     parameters: PolicyParameters,
     predictor: PredictorSettings,
     old: PursuitSettings,
     new: PursuitSettings,
 ) -> PolicyParameters:
     """`parameters` of a policy trained in the game `old`, for the game `new`, which
-    observes as long a history or longer.
+    observes the same or more.
 
-    The first layer's weights for the additional, older frames are zero. The critic,
-    which may see other privileged numbers as well, is left out where the history grows.
+    The first layers' weights for what is additional are zero. The critic, which may see
+    other privileged numbers as well, is left out where something is.
 
     Raises:
       UserError: the policy isn't made of networks.
     """
-    more = (new.observe_history - old.observe_history) * OWN_FRAME
-    if more <= 0:
+    own = _rows(_own_parts(old, predictor), _own_parts(new, predictor))
+    frames = _rows(_frame_parts(old), _frame_parts(new))
+    if own is None and frames is None:
         return parameters
     if not (isinstance(parameters.actor, Mapping) and "params" in parameters.actor):
         raise UserError("the policy has no networks that could learn")
-    # the history comes last in the own state, its oldest frame first: the new rows
-    # stand before it
-    place = old.self_size - old.observe_history * OWN_FRAME
-    inputs = old.self_size + (3 * len(predictor.horizons) if predictor.enabled else 0)
+    params = dict(parameters.actor["params"])
+    encoder = dict(params["encoder"])
+    kernel = _grown(encoder["self_1"]["kernel"], own)
+    # to a multiple of eight, as the encoder pads what it observes
+    kernel = jnp.pad(kernel, ((0, -kernel.shape[0] % 8), (0, 0)))
+    encoder["self_1"] = {**encoder["self_1"], "kernel": kernel}
+    actor = {**parameters.actor, "params": {**params, "encoder": encoder}}
+    guesses = parameters.predictor
+    if predictor.enabled:
+        layers = dict(guesses["params"])
+        layers["input"] = {**layers["input"], "kernel": _grown(layers["input"]["kernel"], frames)}
+        guesses = {**guesses, "params": layers}
+    return parameters.replace(actor=actor, critic={}, predictor=guesses)
 
-    def grow(actor: Any) -> Any:
-        params = dict(actor["params"])
-        encoder = dict(params["encoder"])
-        # without the rows for the encoder's padding, which are added anew for the new
-        # length
-        kernel = encoder["self_1"]["kernel"][:inputs]
-        zeros = jnp.zeros((more, kernel.shape[1]), kernel.dtype)
-        kernel = jnp.concatenate([kernel[:place], zeros, kernel[place:]])
-        # to a multiple of eight, as the encoder pads what it observes
-        kernel = jnp.pad(kernel, ((0, -kernel.shape[0] % 8), (0, 0)))
-        encoder["self_1"] = {**encoder["self_1"], "kernel": kernel}
-        return {**actor, "params": {**params, "encoder": encoder}}
 
-    return parameters.replace(actor=grow(parameters.actor), critic={})
+def _own_parts(game: PursuitSettings, predictor: PredictorSettings) -> dict[str, int]:
+    """What a pursuer's own part of the observation consists of, name -> size, in the
+    order of `Observation.self_state`, and the predicted positions behind it.
+    """
+    parts = {
+        "axes": 16,
+        "time": 4 * game.observe_time,
+        "position": 3 * game.observe_position,
+        "game": 2 * game.observe_game,
+        "arena": int(game.observe_arena),
+        "team code": game.team_code,
+        "own code": game.own_code,
+    }
+    # the oldest frame comes first
+    for age in reversed(range(game.observe_history)):
+        parts[f"frame {age}"] = OWN_FRAME
+    if predictor.enabled:
+        parts["predicted"] = 3 * len(predictor.horizons)
+    return parts
+
+
+def _frame_parts(game: PursuitSettings) -> dict[str, int]:
+    """The same of a frame from which the evader is predicted."""
+    parts = {"time, evader": 7}
+    if game.history_pursuers != "pooled":
+        parts["each"] = 3 * game.num_pursuers
+    if game.history_pursuers != "each":
+        parts["pooled"] = 6
+    return parts
+
+
+def _rows(old: dict[str, int], new: dict[str, int]) -> list[tuple[int, int, int]] | None:
+    """For each part of the new input its first row in the old one, how many rows it has
+    there, and how many are additional; None where none is.
+    """
+    if any(size > new.get(name, 0) for name, size in old.items()):
+        return None  # another game, not a larger one
+    if sum(old.values()) == sum(new.values()):
+        return None
+    place = 0
+    firsts = {}
+    for name, size in old.items():
+        firsts[name] = place
+        place += size
+    rows = []
+    for name, size in new.items():
+        old_size = old.get(name, 0)
+        rows.append((firsts.get(name, 0), old_size, size - old_size))
+    return rows
+
+
+def _grown(kernel, rows):
+    """A kernel (inputs, units) with zeros in the rows of what is additional, and
+    without those of an encoder's padding, which are added anew for the new size.
+    """
+    if rows is None:
+        return kernel
+    parts = []
+    for first, old_size, more in rows:
+        parts += [
+            kernel[first : first + old_size],
+            jnp.zeros((more, kernel.shape[1]), kernel.dtype),
+        ]
+    return jnp.concatenate(parts)

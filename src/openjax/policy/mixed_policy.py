@@ -11,11 +11,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from openjax.policy.policy import Policy, PolicyParameters
 from openjax.policy.settings import NetworkSettings, PredictorSettings
-from openjax.pursuit import Observation
+from openjax.pursuit import Observation, PursuitSettings
 from openjax.pursuit.rows import where_rows
 
 
@@ -119,6 +120,53 @@ class MixedPolicy:
             return self.member.act(member, observation)
 
         return self._pick(act, parameters, observation)
+
+
+@dataclass(frozen=True)
+class SortedPolicy(MixedPolicy):
+    """The same for B worlds that draw by themselves: each member is worked out only in
+    worlds that fly it, so that a step costs little more than one member's.
+
+    Room is kept for eight standard deviations more of a member's worlds than it flies
+    in the mean.
+    """
+
+    most: tuple[float, ...] = ()
+    """Largest share of the worlds that each member flies in the mean."""
+    copies: int = 1
+    """Worlds that draw together."""
+
+    @classmethod
+    def of(cls, policy: MixedPolicy, game: PursuitSettings, copies: int = 1) -> "SortedPolicy":
+        """For the draws of a game; of so many `copies` each draws as the others."""
+        usual = game.strategy_odds or (1.0,) * game.strategies
+        shares = [
+            np.divide(odds, np.sum(odds)) for odds in (usual, game.strategy_odds_unseen or usual)
+        ]
+        most = tuple(np.max(shares, axis=0).tolist())
+        return cls(policy.member, policy.number, most, copies)
+
+    def act(
+        self, parameters: PolicyParameters, observation: Observation
+    ) -> Float[Array, "worlds pursuers 4"]:
+        """The drawn member's mean action in -1..1."""
+        strategy = observation.strategy
+        (worlds,) = strategy.shape
+        spare = 4 * (worlds * self.copies) ** 0.5 + 4
+        rooms = [min(worlds, int(share * worlds + spare)) if share else 1 for share in self.most]
+        is_drawn = strategy[:, None] == jnp.arange(self.number)
+        place = jnp.sum(jnp.where(is_drawn, jnp.cumsum(is_drawn, axis=0) - 1, 0), axis=1)
+        # all members' rooms in one row
+        first = jnp.asarray(np.cumsum([0, *rooms[:-1]]))[strategy]
+        slot = first + jnp.minimum(place, jnp.asarray(rooms)[strategy] - 1)
+        worlds_of = jnp.zeros(sum(rooms), jnp.int32).at[slot].set(jnp.arange(worlds))
+        ends = np.cumsum(rooms).tolist()
+        actions = []
+        for number, (end, room) in enumerate(zip(ends, rooms, strict=True)):
+            own = worlds_of[end - room : end]
+            some = jax.tree.map(lambda leaf, own=own: leaf[own], observation)
+            actions.append(self.member.act(_member(parameters, number), some))
+        return jnp.concatenate(actions)[slot]
 
 
 def _member(parameters, place):

@@ -229,8 +229,21 @@ class PursuitSettings:
     evader (a mixed strategy; not in the paper). More than one is for policies of so
     many members: `openjax.policy.MixedPolicy`.
     """
+    strategy_odds: Annotated[tuple[float, ...], Interval("[0, 1000]")] = ()
+    """Odds of each strategy, in any unit; empty: all have the same."""
+    strategy_odds_unseen: Annotated[tuple[float, ...], Interval("[0, 1000]")] = ()
+    """The same while nobody sees the evader; empty: as while somebody does."""
     strategy_seconds: Annotated[float, Interval("[0, 1000]")] = 0.0
     """Time after which the team draws again (s); 0: never."""
+    team_code: Annotated[int, Interval("[0, 16]")] = 0
+    """Numbers from -1 to 1 that are drawn with the strategies, which all pursuers
+    observe and the evader doesn't: by them one network is many strategies (not in the
+    paper).
+    """
+    own_code: Annotated[int, Interval("[0, 16]")] = 0
+    """The same, of which each pursuer observes its own: pursuers that are alike can take
+    different parts.
+    """
     observe_history: Annotated[int, Interval("[0, 1000]")] = 0
     """Also observe this many of the last frames of the own velocity, attitude and
     command (not in the paper): they show how this vehicle answers, and which commands
@@ -242,9 +255,10 @@ class PursuitSettings:
     """Frames that the evader predictor sees."""
     history_spacing: Annotated[int, Interval("[1, 1000]")] = 1
     """Control steps between two frames of the history."""
-    history_pursuers: Literal["each", "pooled"] = "each"
+    history_pursuers: Literal["each", "pooled", "both"] = "each"
     """What these frames hold of the pursuers. "each": all positions, as in the paper;
-    "pooled": where the nearest one is and whence all press, for teams of any size.
+    "pooled": where the nearest one is and whence all press, for teams of any size;
+    "both": for a team of policies of both kinds.
     """
     reward: RewardSettings = field(default_factory=RewardSettings)
 
@@ -288,6 +302,13 @@ class PursuitSettings:
                 f"environment.team_sizes {list(self.team_sizes)} need environment.num_pursuers "
                 f"{max(self.team_sizes)}, here it's {self.num_pursuers}"
             )
+        for name in ("strategy_odds", "strategy_odds_unseen"):
+            odds = getattr(self, name)
+            if odds and (len(odds) != self.strategies or not sum(odds)):
+                raise UserError(
+                    f"environment.{name} {list(odds)} must be one number for each of the "
+                    f"{self.strategies} strategies, not all of them zero"
+                )
         spans = ("evader_speeds", "capture_radii", "arena_radii", "fall_out_seconds")
         for name in spans:
             # none at all is fine, but for the seconds of those that fall out
@@ -303,11 +324,13 @@ class PursuitSettings:
                 )
 
     def of_one_team(self, number: int) -> "PursuitSettings":
-        """The same game with one size of team, one speed of the evader, one capture
-        radius and one arena.
+        """The same game with one size of team, of which nobody falls out, one speed of
+        the evader, one capture radius and one arena.
         """
         names = ("team_sizes", "evader_speeds", "capture_radii", "arena_radii")
-        return dataclasses.replace(self, num_pursuers=number, **dict.fromkeys(names, ()))
+        return dataclasses.replace(
+            self, num_pursuers=number, fall_outs=0.0, **dict.fromkeys(names, ())
+        )
 
     def observed_as(self, other: "PursuitSettings") -> "PursuitSettings":
         """The same game as pursuers observe it who learned in another one."""
@@ -319,6 +342,11 @@ class PursuitSettings:
         if not self.strategy_seconds:
             return self.episode_length
         return max(1, round(self.strategy_seconds / self.time_step))
+
+    @property
+    def draws(self) -> bool:
+        """Whether the team draws what it flies."""
+        return self.strategies > 1 or self.team_code + self.own_code > 0
 
     @property
     def limited_sight(self) -> bool:
@@ -343,8 +371,8 @@ class PursuitSettings:
         """Numbers in one frame of the history: time, evader position and velocity,
         pursuer positions, or what is pooled of them.
         """
-        pursuers = self.num_pursuers if self.history_pursuers == "each" else 2
-        return 1 + 3 + 3 + 3 * pursuers
+        pursuers = {"each": self.num_pursuers, "pooled": 2, "both": self.num_pursuers + 2}
+        return 1 + 3 + 3 + 3 * pursuers[self.history_pursuers]
 
     @property
     def self_size(self) -> int:
@@ -352,12 +380,13 @@ class PursuitSettings:
         positions.
         """
         # in the order of `Observation.self_state`: evader, quaternion, velocity, two
-        # axes, time, position, the game's numbers, the arena, history
+        # axes, time, position, the game's numbers, the arena, codes, history
         base = 3 + 4 + 3 + 3 + 3
         time = 4 if self.observe_time else 0
         position = 3 if self.observe_position else 0
         game = 2 if self.observe_game else 0
-        size = base + time + position + game + self.observe_arena
+        codes = self.team_code + self.own_code
+        size = base + time + position + game + self.observe_arena + codes
         return size + OWN_FRAME * self.observe_history
 
     @property

@@ -54,8 +54,8 @@ class PursuitState:
     """
 
     strategies: jax.Array | None = None
-    """(D,) int32, the strategies that the team draws one after another in this episode;
-    None: it has only one
+    """(D,) from 0 to 1, the draws of the strategies that the team flies one after
+    another in this episode, and of its codes; None: it has only one and none
     """
 
     @property

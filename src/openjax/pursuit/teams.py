@@ -10,7 +10,8 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int32, PRNGKeyArray, Shaped
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int32, PRNGKeyArray, Shaped
 
 from openjax.pursuit.rows import where_rows
 from openjax.pursuit.settings import PursuitSettings
@@ -117,12 +118,43 @@ def team_mean(
 
 def draw_strategies(
     settings: PursuitSettings, key: PRNGKeyArray, worlds: tuple[int, ...] = ()
-) -> Int32[Array, "*worlds draws"] | None:
-    """(*worlds, D) int32, the strategies that a team flies one after another in an
-    episode, each drawn with equal odds; None where the settings know only one.
+) -> Float[Array, "*worlds draws"] | None:
+    """(*worlds, D) from 0 to 1, by which a team draws the strategies that it flies one
+    after another in an episode (`drawn_strategy`); None where the settings know only
+    one and no codes.
     """
-    if settings.strategies == 1:
+    if not settings.draws:
         return None
     draws = -(-settings.episode_length // settings.strategy_steps)
-    shape = (*worlds, draws)
-    return jax.random.randint(key, shape, 0, settings.strategies, jnp.int32)
+    return jax.random.uniform(key, (*worlds, draws))
+
+
+def drawn_strategy(
+    settings: PursuitSettings, draw: Float[Array, "*worlds"], seen: Bool[Array, "*worlds"]
+) -> Int32[Array, "*worlds"]:
+    """(...) which strategy a `draw` from 0 to 1 means, by the odds of a team that sees
+    the evader or doesn't.
+    """
+    usual = _below(settings.strategy_odds or (1.0,) * settings.strategies)
+    hidden = _below(settings.strategy_odds_unseen) if settings.strategy_odds_unseen else usual
+    below = jnp.where(seen[..., None], usual, hidden)
+    return jnp.sum(draw[..., None] >= below, axis=-1, dtype=jnp.int32)
+
+
+def drawn_codes(settings: PursuitSettings, draw: Float[Array, ""]) -> Float[Array, "drones codes"]:
+    """(N, C) from -1 to 1, the team's code and each pursuer's own, that a `draw` from 0
+    to 1 means.
+    """
+    number, team, own = settings.num_pursuers, settings.team_code, settings.own_code
+    # any bit of the draw changes all numbers
+    bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(draw), jnp.uint32)
+    key = jax.random.fold_in(jax.random.key(0), bits)
+    numbers = jax.random.uniform(key, (team + number * own,), minval=-1.0)
+    of_team = jnp.broadcast_to(numbers[:team], (number, team))
+    return jnp.concatenate([of_team, numbers[team:].reshape(number, own)], axis=-1)
+
+
+def _below(odds):
+    """(K - 1,) the draws below which the first, the second ... strategy is meant."""
+    share = np.cumsum(odds) / np.sum(odds)
+    return share[:-1].astype(np.float32)

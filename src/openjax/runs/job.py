@@ -16,7 +16,7 @@ from openjax.cluster.processes import Processes
 from openjax.errors import UserError
 from openjax.learning import Learner, Parts, TrainSettings
 from openjax.policy import Network, Policy, PolicyParameters
-from openjax.policy.growth import with_longer_history
+from openjax.policy.growth import in_larger_game
 from openjax.pursuit import Pursuit
 from openjax.runs.other_policy import OtherPolicy
 from openjax.runs.train_command import TrainCommand
@@ -128,7 +128,7 @@ def start_parameters(name: str, settings: TrainSettings, parts: Parts) -> Policy
             f"--start_from {name}: it observes in {game.observe_in}, the run in {axes} "
             "(--environment.observe_in)"
         )
-    old = with_longer_history(
+    old = in_larger_game(
         start_policy.parameters, start_policy.settings.predictor, game, settings.environment
     )
     fresh = abstract_parameters(parts.environment, parts.policy)

@@ -157,8 +157,8 @@ def find_opponent(evader: str | Path | Evader, game: PursuitSettings) -> Evader:
     slots = learned_in["max_pillars"]
     # the network's sizes are those of its biases
     width, outputs = (leaves[f"evader/actor/bias_{layer}"].shape[-1] for layer in (0, 2))
-    sizes = (number_of_senses(game.num_pursuers, slots), width, outputs)
-    actor = jax.eval_shape(lambda key: init_network(key, 1, sizes), jax.random.key(0))
+    sizes = (number_of_senses(game.num_pursuers, slots), outputs)
+    actor = jax.eval_shape(lambda key: init_network(key, [width], sizes), jax.random.key(0))
     one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), actor)
     scalar = {"world_axes": jnp.bool_, "hold": jnp.int32}
     abstract = {name: jax.ShapeDtypeStruct((), kind) for name, kind in scalar.items()}
