@@ -4,7 +4,7 @@
 #
 # Two lanes run side by side on the GPU, so that one compiles while the other flies. What is known
 # is in OUTDIR at any time, and `python -m experiments.evaders.judge_table OUTDIR` reads it.
-# Variables: SEED of the evaders (7), STEPS and STEPS_SLOWER of all learners, nominal and slower
+# Variables: SEED of the evaders (7), STEPS and STEPS_SLOWER of both learners, nominal and slower
 # vehicle, SECONDS_IN_ALL (520), PYTHON; EXPLOIT: more of its options.
 set -u
 policy=$1
@@ -28,13 +28,14 @@ part() {
 
 nominal() {
   part nominal $python -m openjax exploit --policy "$policy" --seed "$seed" \
-    --total_steps "${STEPS:-600000000}" --out "$out/evader.npz" --json "$out/nominal.json" \
+    --learners 2 --total_steps "${STEPS:-1000000000}" --out "$out/evader.npz" --json "$out/nominal.json" \
     ${EXPLOIT:-}
 }
 
 slower() {
   part slower $python -m openjax exploit --policy "$policy" --seed "$seed" \
-    --effects experiments/flying/slower.toml --total_steps "${STEPS_SLOWER:-300000000}" \
+    --effects experiments/flying/slower.toml \
+    --learners 2 --total_steps "${STEPS_SLOWER:-500000000}" \
     --out "$out/evader_slower.npz" --json "$out/slower.json" ${EXPLOIT:-}
 }
 

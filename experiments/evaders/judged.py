@@ -4,8 +4,9 @@
 Each FILE is what `openjax exploit --policy NAME --json FILE` wrote: evaders that
 learned against the policy, one that plans in the true simulation, and the scripted
 ones. None of them trained the pursuers. The slower vehicle is `--effects experiments/flying/slower.toml`.
-Stores the least capture rate of each kind, makes the table of judged.md, and writes the
-figures of README and pages (`experiments.figures`).
+Stores the least capture rate of each kind, and of the learners over the steps that they
+have learned; makes table and picture of judged.md, and writes the figures of README and
+pages (`experiments.figures`).
 """
 
 from collections.abc import Callable, Mapping
@@ -15,11 +16,10 @@ from experiments import figures
 from experiments.flying.vehicles import SLOWER
 from experiments.table import RESULTS, Page, Table, page_parser, publish
 from openjax.command_line import run_command
-from openjax.commands.exploit_report import verdict
+from openjax.commands.exploit_report import curve_of, draw_curves, mean_of, verdict
 from openjax.files import read_json
 from openjax.pursuit import SCENARIOS
 from openjax.pursuit.evaders import HELD_OUT
-from openjax.store import DEFAULT_POLICY
 from openjax.vehicle.effects import load_effects
 from openjax.vehicle.parameters import NOMINAL
 
@@ -79,39 +79,59 @@ def study(options) -> dict:
     """The rows of all files, after those stored of other policies."""
     data = options.out.with_suffix(".json")
     stored = read_json(data) if data.exists() else {"rows": [], "runs": {}}
-    rows, runs = stored["rows"], stored["runs"]
+    rows, runs, curves = stored["rows"], stored["runs"], stored.get("curves", {})
     for policy, file in (item.split("=", 1) for item in options.exploited):
         found = read_json(Path(file))
         new = rows_of(policy, found)
         again = {identity(own) for own in new}
         rows = [old for old in rows if identity(old) not in again] + new
-        run = {name: found[name] for name in ("curve", "seconds") if name in found}
-        runs[f"{policy}, {vehicle_of(found)}"] = run
+        name = f"{policy}, {vehicle_of(found)}"
+        runs[name] = {name: found[name] for name in ("curve", "seconds") if name in found}
+        if found.get("budgets"):
+            curves[name] = curve_of(found["budgets"])
     kept = {name: value for name, value in stored.items() if name not in FACTS}
-    return {**kept, "rows": rows, "runs": runs}
+    return {**kept, "rows": rows, "runs": runs, "curves": curves}
+
+
+SHOWN = 250_000_000
+"""Steps of each learner whose row is on the page, beside those of the end."""
 
 
 def page(results: Mapping) -> Page:
-    """One table of least capture rates."""
+    """One table of least capture rates: after learners, and a planner."""
+    rows = []
+    for name, points in results["curves"].items():
+        policy = name.removesuffix(", nominal")
+        near = min(points, key=lambda point: abs(point["steps"] - SHOWN))
+        shown = [near] if near is points[-1] else [near, points[-1]]
+        rows += [
+            {**point, "policy": policy, "judge": f"learners, {point['steps'] / 1e6:.0f} M steps"}
+            for point in shown
+        ]
+        rows += [
+            row
+            for row in results["rows"]
+            if (row["policy"], row["judge"]) == (policy, "a planner")
+            and row["vehicle"] == "nominal"
+        ]
 
     def rate(place: str) -> Callable:
         return lambda row: f"{row['capture_rate'][place]:.2f}"
 
     columns = {
-        "policy": lambda row: (
-            row["policy"] + ("" if row["vehicle"] == "nominal" else f", {row['vehicle']} vehicle")
-        ),
+        "policy": "policy",
         "caught least among": "judge",
         **{place: rate(place) for place in PLACES},
         "most crashes": lambda row: f"{max(row['crash_rate'].values()):.2f}",
+        "heights, m": lambda row: mean_of(row.get("heights", {}).values()),
     }
-    hardest = tuple(JUDGES)[:2]
-    # of other weights than those that ship, what finds most
-    rows = [r for r in results["rows"] if r["policy"] == DEFAULT_POLICY or r["judge"] in hardest]
-    policies = [row["policy"] for row in rows]
-    order = tuple(JUDGES)
-    rows.sort(key=lambda row: (policies.index(row["policy"]), order.index(row["judge"])))
     return Page("The second judge", "Least capture rates.", Table(columns, rows))
+
+
+def draw(results: Mapping, path: Path) -> None:
+    """The curves."""
+    curves = results["curves"].items()
+    draw_curves(path, {name.removesuffix(", nominal"): points for name, points in curves})
 
 
 def main(arguments: list[str]) -> None:
@@ -119,7 +139,7 @@ def main(arguments: list[str]) -> None:
     parser = page_parser(__doc__, "judged")
     parser.add_argument("exploited", nargs="*", metavar="NAME=FILE")
     options = parser.parse_args(arguments)
-    publish(options, study, page)
+    publish(options, study, page, draw)
     if options.out == RESULTS / "judged":
         figures.main([])
 

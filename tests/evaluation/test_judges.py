@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from openjax.evaluation.judges.duel import Duel
-from openjax.evaluation.judges.networks import likeliest, ways
+from openjax.evaluation.judges.networks import apply_network, init_network, likeliest, ways
 from openjax.evaluation.judges.planner import Planner
 from openjax.evaluation.judges.senses import number_of_senses, sense, to_world
 from openjax.evaluation.judges.settings import BestResponseSettings, PlannerSettings
@@ -38,6 +38,33 @@ def state_of(task):
     return state.replace(
         drones=drones, evader_velocity=outward, last_seen=task.evader_position, step=jnp.int32(7)
     )
+
+
+def test_units_that_a_narrow_learner_has_not_got_stay_without_use():
+    settings = BestResponseSettings(learners=4, widths=(6, 3))
+    widths = [settings.width_of(learner) for learner in range(4)]
+    ways = {(width, settings.sees_in_world(i)) for i, width in enumerate(widths)}
+    assert len(ways) == 4, "each width sees in both kinds of axes"
+    network = init_network(KEY, widths, (5, 2))
+    inputs = jax.random.normal(KEY, (4, 7, 5))
+
+    def loss(network):
+        return jnp.sum(jnp.sin(apply_network(network, inputs) + 1.0))
+
+    gradient = jax.jit(jax.grad(loss))(network)
+    for name, axes in (("kernel_0", (2,)), ("kernel_1", (1, 2)), ("kernel_2", (1,))):
+        for axis in axes:
+            spare = jax.lax.slice_in_dim(gradient[name][1], 3, 6, axis=axis - 1)
+            assert not jnp.any(spare), name
+        assert jnp.any(gradient[name][0])
+
+
+def test_learners_are_kept_at_their_looks_and_at_the_end():
+    settings = BestResponseSettings(
+        learners=2, num_envs=16, rollout_length=4, total_steps=5 * 512, looks=(300, 900, 10**9)
+    )
+    assert settings.steps_per_update == 512 and settings.total_updates == 5
+    assert settings.updates_of_looks == [1, 4, 5]
 
 
 @pytest.mark.parametrize("world_axes", [True, False])

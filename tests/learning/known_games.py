@@ -25,7 +25,7 @@ STARTS = 128
 SIZES = {
     "learners": 3,
     "num_envs": 32,
-    "width": 64,
+    "widths": (64,),
     "minibatches": 4,
     "foresight": (4.0,),
     # of a narrower network, Adam's steps move the output less
@@ -52,7 +52,7 @@ def learn(environment: Pursuit, team: Team, draw, steps: int, **changes):
         carry, _ = jax.block_until_ready(step({}, carry))
     tasks = jax.vmap(draw)(jax.random.split(jax.random.key(1), STARTS))
     fly = jax.jit(functools.partial(fly_learners, duel, settings.hold))
-    return fly(carry.evaders, {}, duel.start(tasks, jax.random.key(3))), tasks
+    return fly(carry.evaders, {}, duel.start(tasks, jax.random.key(3)))[0], tasks
 
 
 def against_stack(radius: float, steps: int, **changes) -> dict:
@@ -160,7 +160,7 @@ if __name__ == "__main__":
         "--defaults", action="store_true", help="an accelerator's: those of `openjax exploit`"
     )
     changes = {"seeds": "learners", "worlds": "num_envs"}
-    for name in ("seeds", "worlds", "ways", "minibatches", "epochs", "width", "learning_rate"):
+    for name in ("seeds", "worlds", "ways", "minibatches", "epochs", "learning_rate"):
         setting = changes.get(name, name)
         kind = float if name == "learning_rate" else int
         parser.add_argument(f"--{name}", dest=setting, type=kind, default=argparse.SUPPRESS)

@@ -92,8 +92,8 @@ class MapEvaders:
         programs, wait_for_programs = compile_learning(self.response, parameters)
         wait_for_programs()
         findings = Findings(None, tell, {})
-        evaders = learn(self.command, programs, parameters, findings)
-        return evaders, findings.values["curve"]
+        kept = learn(self.command, programs, parameters, findings)
+        return kept[max(kept)], findings.values["curve"]
 
     def learned(self, evaders: Evaders) -> Flight:
         """Each learner's mean; statistics (B, L)."""
@@ -103,7 +103,7 @@ class MapEvaders:
         def fly(networks, tasks, key):
             parameters, evaders = networks
             start = duel.start(tasks, key)
-            results = fly_learners(duel, hold, evaders, parameters, start)
+            results, _ = fly_learners(duel, hold, evaders, parameters, start)
             return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), results)
 
         return Flight(

@@ -121,7 +121,7 @@ class MapCommand:
     """Stop learning after this time, which begins when all is compiled."""
     learning: BestResponseSettings = dataclasses.field(
         default_factory=lambda: BestResponseSettings(
-            learners=4, total_steps=400_000_000, layouts=0.0
+            learners=4, total_steps=400_000_000, looks=(), num_envs=1024, layouts=0.0
         )
     )
     """How they learn; their tasks are the map's, and `layouts` counts for nothing."""

@@ -39,6 +39,8 @@ from openjax.policy import PolicyParameters
 from openjax.pursuit import EpisodeStatistics, PursuitSettings, PursuitState, Task
 from openjax.pursuit.rows import where_rows
 
+BEGINNING = 2.0
+"""Seconds after which a chase is looked at."""
 FIRST = 0.5
 """Share of the speed that each way has at first."""
 
@@ -100,6 +102,18 @@ class Decisions:
     is_capture: jax.Array  # (T, L * E) bool
 
 
+@struct.dataclass
+class Chase:
+    """What explains an escape, summed over the moments of an episode in which the evader
+    is free.
+    """
+
+    moments: jax.Array  # () how many
+    heights: jax.Array  # () m, the highest pursuer above the lowest
+    seen: jax.Array  # () whether somebody sees the evader
+    nearest: jax.Array  # (3,) m, from the evader to the three nearest pursuers
+
+
 @dataclass(frozen=True, eq=False)
 class BestResponse:
     """The learners against a policy's mean, as pure functions of a `ResponseCarry`."""
@@ -133,16 +147,18 @@ class BestResponse:
         one = jax.tree.map(lambda leaf: leaf[0], world[1])
         inputs = sense(self.game, one, jnp.bool_(False)).size
         log_std = jnp.full((learners, 3), self.settings.initial_log_std, jnp.float32)
-        width, number = self.settings.width, self.settings.ways
-        actor = init_network(actor_key, learners, (inputs, width, 4 * number))
+        settings = self.settings
+        widths = [settings.width_of(learner) for learner in range(learners)]
+        number = settings.ways
+        actor = init_network(actor_key, widths, (inputs, 4 * number))
         # at first one way in each direction, and all as likely
         bias = np.concatenate([spread(number).ravel(), np.zeros(number)])
         actor["bias_2"] = actor["bias_2"] + jnp.asarray(bias, jnp.float32)
         evaders = Evaders(
             actor=actor,
-            critic=init_network(critic_key, learners, (inputs, width, 1)),
+            critic=init_network(critic_key, widths, (inputs, 1)),
             log_std=log_std,
-            world_axes=jnp.arange(learners) % 2 == 1,
+            world_axes=jnp.array([settings.sees_in_world(place) for place in range(learners)]),
             discount=jnp.asarray(self.settings.discounts(self.game.time_step), jnp.float32),
         )
         return ResponseCarry(evaders, self.optimiser.init(evaders.networks), world, key)
@@ -294,21 +310,50 @@ class BestResponse:
 
 def fly_learners(
     duel: Duel, hold: int, evaders: Evaders, parameters: PolicyParameters, start: World
-) -> EpisodeStatistics:
-    """Statistics (L, B): an episode of each learner, without noise, from each of B
-    starts.
+) -> tuple[EpisodeStatistics, Chase]:
+    """Statistics and what the chases are like (L, B): an episode of each learner,
+    without noise, from each of B starts.
     """
     game = duel.environment.settings
     learners = evaders.world_axes.size
 
-    def one(world, _):
+    def one(carry, _):
+        world, chase = carry
         decision = likeliest(apply_network(evaders.actor, _sense(game, evaders, world[1])))
         velocity = _in_world(evaders, decision, world[1])
-        return duel.fly(parameters, world, velocity, hold), None
+        world = duel.fly(parameters, world, velocity, hold)
+        look = jax.vmap(functools.partial(look_at, game))
+        return (world, jax.tree.map(jnp.add, chase, look(world[1]))), None
 
     world = copies(start, learners)
-    statistics = jax.lax.scan(one, world, length=game.episode_length // hold)[0][1].statistics
-    return jax.tree.map(lambda leaf: leaf.reshape(learners, -1), statistics)
+    chase = jax.vmap(functools.partial(look_at, game))(world[1])
+    carry = world, jax.tree.map(jnp.zeros_like, chase)
+    world, chase = jax.lax.scan(one, carry, length=game.episode_length // hold)[0]
+
+    def by_learner(leaf):
+        return leaf.reshape(learners, -1, *leaf.shape[1:])
+
+    return jax.tree.map(by_learner, (world[1].statistics, chase))
+
+
+def look_at(game: PursuitSettings, state: PursuitState) -> Chase:
+    """One moment of one world, all zeros where the evader is caught already or the
+    chase has hardly begun.
+    """
+    counts = ~state.statistics.captured & (state.step * game.time_step >= BEGINNING)
+    position = state.drones.position
+    there = jnp.ones(len(position), bool) if state.active is None else state.active
+    height = position[:, 2]
+    highest = jnp.max(jnp.where(there, height, -jnp.inf))
+    distance = jnp.linalg.norm(position - state.evader_position, axis=-1)
+    distance = jnp.sort(jnp.where(there, distance, game.arena_radius * 2))
+    moment = Chase(
+        moments=jnp.ones(()),
+        heights=highest - jnp.min(jnp.where(there, height, jnp.inf)),
+        seen=state.seen.astype(jnp.float32),
+        nearest=jnp.pad(distance, (0, 3))[:3],
+    )
+    return jax.tree.map(lambda leaf: jnp.where(counts, leaf, 0.0), moment)
 
 
 def _axes(evaders, state):

@@ -2,24 +2,40 @@
 first.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 
 Network = dict[str, jax.Array]
 
 
-def init_network(key: jax.Array, learners: int, sizes: tuple[int, int, int]) -> Network:
-    """Parameters of L networks whose output is nearly zero at first; of as many inputs,
-    units in both hidden layers, and outputs as `sizes` say.
+def init_network(key: jax.Array, widths: Sequence[int], sizes: tuple[int, int]) -> Network:
+    """Parameters of networks whose output is nearly zero at first, one for each of the
+    `widths` of both hidden layers; of as many inputs and outputs as `sizes` say.
+
+    All have as many units as the widest. Those that a narrower one hasn't got begin
+    with zeros before and behind them, which have no gradient, and so stay without use.
     """
-    inputs, width, outputs = sizes
+    inputs, outputs = sizes
+    learners = len(widths)
+    width = max(widths)
+    is_unit = jnp.arange(width) < jnp.asarray(widths)[:, None]  # (L, width)
     sizes = (inputs, width, width, outputs)
     scales = (1.0, 1.0, 0.01)
     network = {}
     for i, scale in enumerate(scales):
         key, layer_key = jax.random.split(key)
         shape = (learners, sizes[i], sizes[i + 1])
-        network[f"kernel_{i}"] = scale * jax.random.normal(layer_key, shape) / jnp.sqrt(sizes[i])
+        kernel = scale * jax.random.normal(layer_key, shape)
+        if i > 0:
+            kernel = jnp.where(is_unit[:, :, None], kernel, 0.0)
+            kernel /= jnp.sqrt(jnp.asarray(widths, jnp.float32))[:, None, None]
+        else:
+            kernel /= jnp.sqrt(inputs)
+        if i < 2:
+            kernel = jnp.where(is_unit[:, None], kernel, 0.0)
+        network[f"kernel_{i}"] = kernel
         network[f"bias_{i}"] = jnp.zeros((learners, 1, sizes[i + 1]))
     return network
 

@@ -11,11 +11,22 @@ from openjax.ranges import Interval, check_intervals
 class BestResponseSettings:
     """Settings of evaders that learn against fixed pursuers."""
 
-    learners: Annotated[int, Interval("[1, 64]")] = 8
-    """Evaders that learn side by side; every second one in the world's axes."""
-    total_steps: Annotated[int, Interval("[1, 1e15]")] = 800_000_000
+    learners: Annotated[int, Interval("[1, 64]")] = 4
+    """Evaders that learn side by side: of two widths, each in the world's axes and in
+    its own.
+    """
+    total_steps: Annotated[int, Interval("[1, 1e15]")] = 6_000_000_000
     """Environment steps of all learners."""
-    num_envs: Annotated[int, Interval("[1, 16777216]")] = 1024
+    looks: Annotated[tuple[int, ...], Interval("[1, 1e15]")] = (
+        100_000_000,
+        250_000_000,
+        500_000_000,
+        1_000_000_000,
+    )
+    """Steps of each learner after which all are kept and fly later, as they do at the
+    end: how well a policy holds is a curve over what its attacker spends.
+    """
+    num_envs: Annotated[int, Interval("[1, 16777216]")] = 4096
     """Worlds of each learner."""
     hold: Annotated[int, Interval("[1, 1000]")] = 4
     """Control steps for which a decision is flown: 40 ms, in which an evader moves 5
@@ -25,21 +36,21 @@ class BestResponseSettings:
     """Velocities of which a decision chooses one: where left and right are equally
     good, the mean of a single one leads into the middle.
     """
-    width: Annotated[int, Interval("[1, 4096]")] = 256
-    """Width of both hidden layers: 100 numbers are sensed, and two layers of 64 gave
-    evaders that ran into corners.
+    widths: Annotated[tuple[int, ...], Interval("[1, 4096]")] = (256, 128)
+    """Width of both hidden layers, of learner after learner: 100 numbers are sensed,
+    and two layers of 64 gave evaders that ran into corners.
     """
-    rollout_length: Annotated[int, Interval("[1, 100000]")] = 25
-    """Decisions per iteration: a second of the game."""
-    foresight: tuple[float, ...] = (4.0, 4.0, 2.0, 2.0)
+    rollout_length: Annotated[int, Interval("[1, 100000]")] = 16
+    """Decisions per iteration: two thirds of a second of the game."""
+    foresight: tuple[float, ...] = (4.0,)
     """Seconds after which what comes counts 1/e, of learner after learner: traps take
     one to three.
     """
     gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
     """Lambda of the generalised advantage estimate."""
-    learning_rate: Annotated[float, Interval("(0, 1]")] = 5e-4
+    learning_rate: Annotated[float, Interval("(0, 1]")] = 7e-4
     """Adam step size at the start; falls linearly to zero."""
-    epochs: Annotated[int, Interval("[1, 1000]")] = 4
+    epochs: Annotated[int, Interval("[1, 1000]")] = 3
     """Passes over each iteration's rollouts."""
     minibatches: Annotated[int, Interval("[1, 100000]")] = 16
     """Gradient steps of one pass: with four, learners come to .972 to .978 of the
@@ -72,6 +83,8 @@ class BestResponseSettings:
             raise UserError(
                 f"specialists {self.specialists}: at most the {self.learners} learners can be some"
             )
+        if not self.widths:
+            raise UserError("widths: at least one number is needed")
         if not self.foresight or min(self.foresight) <= 0.0:
             raise UserError(f"foresight {self.foresight}: seconds above zero are needed")
         if self.num_envs * self.rollout_length % self.minibatches:
@@ -89,6 +102,26 @@ class BestResponseSettings:
     def total_updates(self) -> int:
         """Iterations of the run."""
         return max(1, -(-self.total_steps // self.steps_per_update))
+
+    @property
+    def updates_of_looks(self) -> list[int]:
+        """Iterations after which learners are kept, those of the run's end among
+        them.
+        """
+        steps = self.steps_per_update // self.learners
+        updates = {max(1, round(look / steps)) for look in self.looks}
+        total = self.total_updates
+        return sorted({update for update in updates if update < total} | {total})
+
+    def width_of(self, learner: int) -> int:
+        """Of its hidden layers."""
+        return self.widths[learner % len(self.widths)]
+
+    def sees_in_world(self, learner: int) -> bool:
+        """Whether it sees in the world's axes; of four learners of two widths each
+        width does both.
+        """
+        return (learner + learner // len(self.widths)) % 2 == 1
 
     @property
     def gradient_steps(self) -> int:
