@@ -29,8 +29,6 @@ def test_the_grown_policy_acts_alike(frames, predicts, pursuers):
         observe_history=3,
         observe_game=True,
         observe_arena=True,
-        team_code=1,
-        own_code=2,
         history_pursuers="both",
     )
     network = NetworkSettings(features=8, heads=2)

@@ -12,7 +12,7 @@ from openjax.errors import UserError
 from openjax.evaluation.judges.planner import without_foresight
 from openjax.policy import MixedPolicy, SortedPolicy, mixed_parameters
 from openjax.pursuit import Pursuit, PursuitSettings
-from openjax.pursuit.teams import drawn_codes, drawn_strategy
+from openjax.pursuit.teams import strategy_of
 from openjax.store.mixed_policies import Draws, member, mixed_policy
 from tests.policy.parameters import random_parameters
 from tests.policy.test_policy import POLICY, observation_of
@@ -84,7 +84,7 @@ def test_a_team_draws_by_its_odds_and_by_others_while_nobody_sees_the_evader():
     )
     draws = jnp.linspace(0.0, 0.999, 400)
     for seen, shares in ((True, (0.25, 0.0, 0.75)), (False, (0.0, 1.0, 0.0))):
-        drawn = drawn_strategy(game, draws, jnp.full(400, seen))
+        drawn = strategy_of(game, draws, jnp.full(400, seen))
         np.testing.assert_allclose(np.bincount(drawn, minlength=3) / 400, shares, atol=0.01)
 
 
@@ -104,16 +104,6 @@ def test_worlds_sorted_by_what_they_fly_act_as_unsorted(members):
         by_member = SortedPolicy.of(unsorted, GAME, copies)
         actions = [jax.jit(policy.act)(parameters, observation) for policy in (unsorted, by_member)]
         np.testing.assert_allclose(*actions, atol=1e-5)
-
-
-def test_codes_are_the_teams_and_each_pursuers_own_and_change_with_the_draws():
-    game = dataclasses.replace(GAME, strategies=1, team_code=2, own_code=1)
-    assert game.draws and not dataclasses.replace(game, team_code=0, own_code=0).draws
-    codes = jax.vmap(lambda draw: drawn_codes(game, draw))(jnp.linspace(0.0, 1.0, 500))
-    np.testing.assert_array_equal(codes[:, 0, :2], codes[:, 2, :2])
-    numbers = jnp.concatenate([codes[:, 0, :2], codes[:, :, 2]], axis=1)
-    np.testing.assert_allclose(jnp.corrcoef(numbers.T), np.eye(5), atol=0.2)
-    assert float(numbers.min()) >= -1.0 and float(numbers.std()) == pytest.approx(3**-0.5, 0.1)
 
 
 def test_an_evader_that_plans_knows_who_flies_and_not_who_comes_next(worlds):

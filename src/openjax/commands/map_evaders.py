@@ -92,8 +92,8 @@ class MapEvaders:
         programs, wait_for_programs = compile_learning(self.response, parameters)
         wait_for_programs()
         findings = Findings(None, tell, {})
-        kept = learn(self.command, programs, parameters, findings)
-        return kept[max(kept)], findings.values["curve"]
+        looks = learn(self.command, programs, parameters, findings)
+        return looks[max(looks)], findings.values["curve"]
 
     def learned(self, evaders: Evaders) -> Flight:
         """Each learner's mean; statistics (B, L)."""

@@ -27,15 +27,15 @@ def in_larger_game(
     Raises:
       UserError: the policy isn't made of networks.
     """
-    own = _rows(_own_parts(old, predictor), _own_parts(new, predictor))
+    inputs = _rows(_own_parts(old, predictor), _own_parts(new, predictor))
     frames = _rows(_frame_parts(old), _frame_parts(new))
-    if own is None and frames is None:
+    if inputs is None and frames is None:
         return parameters
     if not (isinstance(parameters.actor, Mapping) and "params" in parameters.actor):
         raise UserError("the policy has no networks that could learn")
     params = dict(parameters.actor["params"])
     encoder = dict(params["encoder"])
-    kernel = _grown(encoder["self_1"]["kernel"], own)
+    kernel = _with_rows(encoder["self_1"]["kernel"], inputs)
     # to a multiple of eight, as the encoder pads what it observes
     kernel = jnp.pad(kernel, ((0, -kernel.shape[0] % 8), (0, 0)))
     encoder["self_1"] = {**encoder["self_1"], "kernel": kernel}
@@ -43,7 +43,10 @@ def in_larger_game(
     guesses = parameters.predictor
     if predictor.enabled:
         layers = dict(guesses["params"])
-        layers["input"] = {**layers["input"], "kernel": _grown(layers["input"]["kernel"], frames)}
+        layers["input"] = {
+            **layers["input"],
+            "kernel": _with_rows(layers["input"]["kernel"], frames),
+        }
         guesses = {**guesses, "params": layers}
     return parameters.replace(actor=actor, critic={}, predictor=guesses)
 
@@ -58,8 +61,6 @@ def _own_parts(game: PursuitSettings, predictor: PredictorSettings) -> dict[str,
         "position": 3 * game.observe_position,
         "game": 2 * game.observe_game,
         "arena": int(game.observe_arena),
-        "team code": game.team_code,
-        "own code": game.own_code,
     }
     # the oldest frame comes first
     for age in reversed(range(game.observe_history)):
@@ -99,7 +100,7 @@ def _rows(old: dict[str, int], new: dict[str, int]) -> list[tuple[int, int, int]
     return rows
 
 
-def _grown(kernel, rows):
+def _with_rows(kernel, rows):
     """A kernel (inputs, units) with zeros in the rows of what is additional, and
     without those of an encoder's padding, which are added anew for the new size.
     """

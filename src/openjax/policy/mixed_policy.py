@@ -163,8 +163,8 @@ class SortedPolicy(MixedPolicy):
         ends = np.cumsum(rooms).tolist()
         actions = []
         for number, (end, room) in enumerate(zip(ends, rooms, strict=True)):
-            own = worlds_of[end - room : end]
-            some = jax.tree.map(lambda leaf, own=own: leaf[own], observation)
+            flying = worlds_of[end - room : end]
+            some = jax.tree.map(lambda leaf, flying=flying: leaf[flying], observation)
             actions.append(self.member.act(_member(parameters, number), some))
         return jnp.concatenate(actions)[slot]
 

@@ -13,7 +13,7 @@ from openjax.pursuit.settings import HIDDEN, PursuitSettings
 from openjax.pursuit.shapes import Actions, Count, Flag, Quaternions, Team, Vector, Which
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.task import arena_of, capture_radius, evader_speed
-from openjax.pursuit.teams import drawn_codes, drawn_strategy, of_team
+from openjax.pursuit.teams import of_team, strategy_of
 from openjax.vehicle import DroneState
 from openjax.vehicle.family import standard_parameters
 
@@ -31,7 +31,7 @@ class Observation:
 
     self_state: jax.Array
     """(N, S) evader, quaternion wxyz, velocity, body x, body z axis, t/T x 4 [,
-    position] [, evader's speed and capture radius] [, arena] [, codes] [, history]
+    position] [, evader's speed and capture radius] [, arena] [, history]
     """
     others: jax.Array
     """(N, N - 1, O) other pursuers: relative position [, relative velocity, body z
@@ -95,11 +95,11 @@ def frame_pursuers(
     """
     if settings.history_pursuers == "each":
         return position
-    pooled = _pooled(position, evader, active)
-    return pooled if settings.history_pursuers == "pooled" else jnp.concatenate([position, pooled])
+    two = _nearest_and_sum(position, evader, active)
+    return two if settings.history_pursuers == "pooled" else jnp.concatenate([position, two])
 
 
-def _pooled(position, evader, active):
+def _nearest_and_sum(position, evader, active):
     """(2, 3) of `frame_pursuers`."""
     offset = position - evader
     square = jnp.sum(offset**2, axis=-1)
@@ -172,14 +172,10 @@ def _strategy(settings, state):
     """() which of its strategies the team flies now."""
     if settings.strategies == 1:
         return None
-    return drawn_strategy(settings, _draw(settings, state), state.seen)
-
-
-def _draw(settings, state):
-    """() from 0 to 1, what the team has drawn for now."""
     place = state.step // settings.strategy_steps
     # the episode's last observation is that of a step which isn't flown any more
-    return state.strategies[jnp.minimum(place, len(state.strategies) - 1)]
+    draw = state.strategies[jnp.minimum(place, len(state.strategies) - 1)]
+    return strategy_of(settings, draw, state.seen)
 
 
 def _heading(drones):
@@ -211,8 +207,6 @@ def _own_part(settings, state, seen_drones, turn_back):
     if settings.observe_arena:
         radius = jnp.float32(arena_of(settings, state.task).arena_radius)
         parts.append(jnp.broadcast_to(radius, (len(position), 1)))
-    if settings.team_code + settings.own_code:
-        parts.append(drawn_codes(settings, _draw(settings, state)))
     if settings.observe_history:
         spacing = settings.observe_history_spacing
         history = jnp.moveaxis(state.own_history[spacing - 1 :: spacing], 0, 1)

@@ -235,15 +235,6 @@ class PursuitSettings:
     """The same while nobody sees the evader; empty: as while somebody does."""
     strategy_seconds: Annotated[float, Interval("[0, 1000]")] = 0.0
     """Time after which the team draws again (s); 0: never."""
-    team_code: Annotated[int, Interval("[0, 16]")] = 0
-    """Numbers from -1 to 1 that are drawn with the strategies, which all pursuers
-    observe and the evader doesn't: by them one network is many strategies (not in the
-    paper).
-    """
-    own_code: Annotated[int, Interval("[0, 16]")] = 0
-    """The same, of which each pursuer observes its own: pursuers that are alike can take
-    different parts.
-    """
     observe_history: Annotated[int, Interval("[0, 1000]")] = 0
     """Also observe this many of the last frames of the own velocity, attitude and
     command (not in the paper): they show how this vehicle answers, and which commands
@@ -344,11 +335,6 @@ class PursuitSettings:
         return max(1, round(self.strategy_seconds / self.time_step))
 
     @property
-    def draws(self) -> bool:
-        """Whether the team draws what it flies."""
-        return self.strategies > 1 or self.team_code + self.own_code > 0
-
-    @property
     def limited_sight(self) -> bool:
         """True if something else than pillars can hide the evader."""
         full_sight = PursuitSettings.sight_range, PursuitSettings.sight_angle
@@ -380,13 +366,12 @@ class PursuitSettings:
         positions.
         """
         # in the order of `Observation.self_state`: evader, quaternion, velocity, two
-        # axes, time, position, the game's numbers, the arena, codes, history
+        # axes, time, position, the game's numbers, the arena, history
         base = 3 + 4 + 3 + 3 + 3
         time = 4 if self.observe_time else 0
         position = 3 if self.observe_position else 0
         game = 2 if self.observe_game else 0
-        codes = self.team_code + self.own_code
-        size = base + time + position + game + self.observe_arena + codes
+        size = base + time + position + game + self.observe_arena
         return size + OWN_FRAME * self.observe_history
 
     @property

@@ -55,7 +55,7 @@ class PursuitState:
 
     strategies: jax.Array | None = None
     """(D,) from 0 to 1, the draws of the strategies that the team flies one after
-    another in this episode, and of its codes; None: it has only one and none
+    another in this episode; None: it has only one
     """
 
     @property

@@ -120,38 +120,25 @@ def draw_strategies(
     settings: PursuitSettings, key: PRNGKeyArray, worlds: tuple[int, ...] = ()
 ) -> Float[Array, "*worlds draws"] | None:
     """(*worlds, D) from 0 to 1, by which a team draws the strategies that it flies one
-    after another in an episode (`drawn_strategy`); None where the settings know only
-    one and no codes.
+    after another in an episode (`strategy_of`); None where the settings know only
+    one.
     """
-    if not settings.draws:
+    if settings.strategies == 1:
         return None
     draws = -(-settings.episode_length // settings.strategy_steps)
     return jax.random.uniform(key, (*worlds, draws))
 
 
-def drawn_strategy(
-    settings: PursuitSettings, draw: Float[Array, "*worlds"], seen: Bool[Array, "*worlds"]
+def strategy_of(
+    settings: PursuitSettings, draw: Float[Array, "*worlds"], is_seen: Bool[Array, "*worlds"]
 ) -> Int32[Array, "*worlds"]:
     """(...) which strategy a `draw` from 0 to 1 means, by the odds of a team that sees
     the evader or doesn't.
     """
     usual = _below(settings.strategy_odds or (1.0,) * settings.strategies)
-    hidden = _below(settings.strategy_odds_unseen) if settings.strategy_odds_unseen else usual
-    below = jnp.where(seen[..., None], usual, hidden)
+    while_unseen = _below(settings.strategy_odds_unseen) if settings.strategy_odds_unseen else usual
+    below = jnp.where(is_seen[..., None], usual, while_unseen)
     return jnp.sum(draw[..., None] >= below, axis=-1, dtype=jnp.int32)
-
-
-def drawn_codes(settings: PursuitSettings, draw: Float[Array, ""]) -> Float[Array, "drones codes"]:
-    """(N, C) from -1 to 1, the team's code and each pursuer's own, that a `draw` from 0
-    to 1 means.
-    """
-    number, team, own = settings.num_pursuers, settings.team_code, settings.own_code
-    # any bit of the draw changes all numbers
-    bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(draw), jnp.uint32)
-    key = jax.random.fold_in(jax.random.key(0), bits)
-    numbers = jax.random.uniform(key, (team + number * own,), minval=-1.0)
-    of_team = jnp.broadcast_to(numbers[:team], (number, team))
-    return jnp.concatenate([of_team, numbers[team:].reshape(number, own)], axis=-1)
 
 
 def _below(odds):

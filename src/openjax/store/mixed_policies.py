@@ -71,14 +71,12 @@ def common_game(games: Sequence[PursuitSettings]) -> PursuitSettings:
     """The first of some games, in which pursuers observe all that they do in any."""
     first = games[0]
     kinds = {game.history_pursuers for game in games}
-    seen = ("observe_position", "observe_game", "observe_arena")
+    choices = ("observe_position", "observe_game", "observe_arena")
     return dataclasses.replace(
         first,
         observe_history=max(game.observe_history for game in games),
         history_pursuers=kinds.pop() if len(kinds) == 1 else "both",
-        team_code=max(game.team_code for game in games),
-        own_code=max(game.own_code for game in games),
-        **{name: any(getattr(game, name) for game in games) for name in seen},
+        **{name: any(getattr(game, name) for game in games) for name in choices},
     )
 
 
@@ -92,7 +90,7 @@ def _in_game(policy, environment):
     )
     game = settings.environment
     names = ("observe_history", "history_pursuers", "observe_position", "observe_game")
-    for name in (*names, "observe_arena", "team_code", "own_code"):
+    for name in (*names, "observe_arena"):
         game = dataclasses.replace(game, **{name: getattr(environment.settings, name)})
     settings = dataclasses.replace(settings, environment=game)
     return dataclasses.replace(policy, parameters=parameters, settings=settings).in_game(

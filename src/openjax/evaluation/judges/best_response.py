@@ -110,7 +110,7 @@ class Chase:
 
     moments: jax.Array  # () how many
     heights: jax.Array  # () m, the highest pursuer above the lowest
-    seen: jax.Array  # () whether somebody sees the evader
+    in_sight: jax.Array  # () whether somebody sees the evader
     nearest: jax.Array  # (3,) m, from the evader to the three nearest pursuers
 
 
@@ -342,15 +342,15 @@ def look_at(game: PursuitSettings, state: PursuitState) -> Chase:
     """
     counts = ~state.statistics.captured & (state.step * game.time_step >= BEGINNING)
     position = state.drones.position
-    there = jnp.ones(len(position), bool) if state.active is None else state.active
+    active = jnp.ones(len(position), bool) if state.active is None else state.active
     height = position[:, 2]
-    highest = jnp.max(jnp.where(there, height, -jnp.inf))
+    highest = jnp.max(jnp.where(active, height, -jnp.inf))
     distance = jnp.linalg.norm(position - state.evader_position, axis=-1)
-    distance = jnp.sort(jnp.where(there, distance, game.arena_radius * 2))
+    distance = jnp.sort(jnp.where(active, distance, game.arena_radius * 2))
     moment = Chase(
         moments=jnp.ones(()),
-        heights=highest - jnp.min(jnp.where(there, height, jnp.inf)),
-        seen=state.seen.astype(jnp.float32),
+        heights=highest - jnp.min(jnp.where(active, height, jnp.inf)),
+        in_sight=state.seen.astype(jnp.float32),
         nearest=jnp.pad(distance, (0, 3))[:3],
     )
     return jax.tree.map(lambda leaf: jnp.where(counts, leaf, 0.0), moment)
