@@ -16,7 +16,7 @@ from openjax.gap.residual import disturbances
 from openjax.gap.where import CALM, before_and_after
 from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, add_legend, as_svg, small_figure
 
-HORIZONS_SHOWN = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)  # s
+AHEAD = HORIZONS["velocity"]  # s
 BINS = 15
 WIDTH = 4.6  # inches, read on a phone as on a desk
 
@@ -29,7 +29,7 @@ def figures(report: Report) -> list[tuple[str, str, str]]:
         return []
     entries = []
     with rc_context(STYLE):
-        for draw in (_places, _course, _horizons, _coordinate):
+        for draw in (_places, _course, _coordinate):
             parts = draw(report)
             if parts is not None:
                 title, text, figure = parts
@@ -79,32 +79,19 @@ def _places(report: Report):
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """What is drawn of one channel of one flight."""
+    """Errors of one channel of one flight."""
 
     flight: str
-    dt: float
     time: np.ndarray  # (T,) s
-    before: np.ndarray  # (T,) in `unit`
-    after: np.ndarray
+    nominal: np.ndarray  # (T,) in `unit`
+    with_effects: np.ndarray
     name: str
     unit: str
-    adds_up: bool
-    """Whether errors of a prediction are differences of these; else these are the
-    errors.
-    """
-
-    def errors(self, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        """Errors of predictions so far ahead, before and after."""
-        if not self.adds_up:
-            return self.before, self.after
-        step = max(round(seconds / self.dt), 1)
-        return tuple(v[step:] - v[:-step] for v in (self.before, self.after))
 
     @property
     def ratio(self) -> float:
-        """By how much the error is larger before."""
-        nominal, remaining = (rms(e) for e in self.errors(HORIZONS["velocity"]))
-        return nominal / max(remaining, 1e-12)
+        """By how much the nominal error is larger."""
+        return rms(self.nominal) / max(rms(self.with_effects), 1e-12)
 
 
 def rms(values: Float[np.ndarray, "..."]) -> float:
@@ -128,44 +115,35 @@ def _courses(report: Report) -> Iterator[Course]:
                 skip = int(SKIP / track.dt) if len(with_effects) > 1 else 0
                 yield Course(
                     flight=track.name,
-                    dt=track.dt,
                     time=track.time[skip:],
-                    before=np.resize(nominal, len(track))[skip:] / scale,
-                    after=np.resize(with_effects, len(track))[skip:] / scale,
+                    nominal=np.resize(nominal, len(track))[skip:] / scale,
+                    with_effects=np.resize(with_effects, len(track))[skip:] / scale,
                     name="mean motor command" if name == "motors all" else name,
                     unit="times the noise",
-                    adds_up=False,
                 )
 
 
 def _courses_of_motion(report: Report) -> Iterator[Course]:
-    """Body rates and velocity of every flight, as far as they were logged."""
+    """Errors of short predictions of body rates and velocity of every flight, as far as
+    they were logged.
+    """
     evidence = report.plots["evidence"]
-    axes = [axis for axis in range(6) if evidence.replay.usable[axis]]
     nominal, with_effects = _residuals(report)
-    for track, nominal_errors, corrected_errors in zip(
-        evidence.tracks, nominal, with_effects, strict=True
-    ):
+    axes = [axis for axis in range(6) if evidence.replay.usable[axis]]
+    for number, track in enumerate(evidence.tracks):
+        step = max(round(AHEAD / track.dt), 1)
         skip = int(SKIP / track.dt)
         for axis in axes:
             name, unit = _axis_name(axis)
+            before, after = (r[number][skip:, axis] for r in (nominal, with_effects))
             yield Course(
                 flight=track.name,
-                dt=track.dt,
-                time=track.time[skip:],
-                before=nominal_errors[skip:, axis],
-                after=corrected_errors[skip:, axis],
+                time=track.time[skip + step :],
+                nominal=before[step:] - before[:-step],
+                with_effects=after[step:] - after[:-step],
                 name=name,
                 unit=unit,
-                adds_up=True,
             )
-
-
-def _worst(report: Report) -> Course | None:
-    """Where the nominal simulator errs most, against what is left; None where no
-    channel of motion or firmware was logged.
-    """
-    return max(_courses(report), key=lambda course: course.ratio, default=None)
 
 
 def _axis_name(axis: int) -> tuple[str, str]:
@@ -176,18 +154,19 @@ def _axis_name(axis: int) -> tuple[str, str]:
 
 
 def _course(report: Report):
-    """Errors of short predictions along the flight where they are largest."""
-    course = _worst(report)
+    """Errors of short predictions along the flight where the nominal simulator errs
+    most, against what is left.
+    """
+    course = max(_courses(report), key=lambda course: course.ratio, default=None)
     if course is None:
         return None
-    nominal, remaining = course.errors(HORIZONS["velocity"])
     figure, axes = small_figure((WIDTH, 3.0))
-    time = course.time[-len(remaining) :] - course.time[0]
+    time = course.time - course.time[0]
     # so many standard deviations hold 90 % of a normal distribution
-    band = 1.645 * rms(remaining)
+    band = 1.645 * rms(course.with_effects)
     label = "90 % of what is left" if report.parameters else "90 % of all errors"
     axes.axhspan(-band, band, color=GREY, alpha=0.25, linewidth=0, label=label)
-    for error, colour, label in _lines(report, nominal, remaining):
+    for error, colour, label in _lines(report, course.nominal, course.with_effects):
         axes.plot(time, error, color=colour, linewidth=1.1, label=label)
     axes.set(
         xlabel="time in the flight [s]",
@@ -195,7 +174,7 @@ def _course(report: Report):
         xlim=(time[0], time[-1]),
     )
     add_legend(axes)
-    ahead = f" of predictions {HORIZONS['velocity']} s ahead" if course.adds_up else ""
+    ahead = "" if course.unit == "times the noise" else f" of predictions {AHEAD} s ahead"
     return ("One flight", f"{course.flight}: error of {course.name}{ahead}.", figure)
 
 
@@ -206,32 +185,6 @@ def _lines(report: Report, nominal, with_effects) -> Sequence[tuple]:
     if not report.parameters:
         return ((nominal, AFTER if report.verdict == "none" else BEFORE, "nominal simulator"),)
     return (nominal, BEFORE, "nominal simulator"), (with_effects, AFTER, "with the named effects")
-
-
-def _horizons(report: Report):
-    """How errors grow with the time that is predicted."""
-    course = _worst(report)
-    if course is None or not course.adds_up:
-        return None
-    ahead = sorted({max(round(h / course.dt), 1) * course.dt for h in HORIZONS_SHOWN})
-    figure, axes = small_figure((WIDTH, 3.0))
-    sizes = np.array([[rms(error) for error in course.errors(h)] for h in ahead])
-    nominal, remaining = sizes.T
-    for size, colour, label in _lines(report, nominal, remaining):
-        axes.semilogx(ahead, size, "o-", color=colour, markersize=5, label=label)
-    axes.set(
-        xlabel="time ahead [s]",
-        ylabel=f"rms error of {course.name} [{course.unit}]",
-        ylim=(0, 1.1 * sizes.max()),
-    )
-    axes.set_xticks(HORIZONS_SHOWN, [f"{horizon:g}" for horizon in HORIZONS_SHOWN])
-    axes.minorticks_off()
-    add_legend(axes)
-    return (
-        "How far ahead",
-        f"{course.flight}: the error grows with the time that is predicted.",
-        figure,
-    )
 
 
 def _coordinate(report: Report):

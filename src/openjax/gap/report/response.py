@@ -9,13 +9,13 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from openjax.gap.identification.quantities import Identification, Quantity, words_of
+from openjax.gap.identification.quantities import KINDS, MATTERS, Identification, Quantity, words_of
 from openjax.gap.identification.responses import Pair
 from openjax.gap.model.library import CARDS
 from openjax.gap.report.report import Report
 from openjax.show.pages import AFTER, BEFORE, STYLE, as_svg
 
-MATTERS = ("differs: a cause below", "differs: in effects.toml, no cause below")
+DIFFERS = ("differs: a cause below", "differs: in effects.toml, no cause below")
 """What is said of numbers that matter."""
 PANEL = (2.9, 4.0)  # inches, of one axis
 
@@ -35,16 +35,28 @@ def response_of(report: Report) -> dict | None:
             "effect": q.effect.replace("_", " "),
             "meaning": meaning_of(name, q, report),
             "differs": q.differs,
-            "matters": meaning_of(name, q, report) in MATTERS,
+            "matters": meaning_of(name, q, report) in DIFFERS,
         }
         for name, q in report.numbers.items()
     ]
     return {
         "sentences": report.measured_in_words() or [does.sentence()],
+        "limits": _limits(),
         "remarks": does.remarks if does.trustworthy else does.remarks[1:],
         "rows": sorted(rows, key=lambda row: not row["matters"]),
         "pictures": pictures_of(does),
     }
+
+
+def _limits() -> str:
+    """From which differences on a number matters."""
+    times = {kind.effect for kind in KINDS.values() if kind.unit == "s"}
+    sizes = [
+        f"{least * 1e3:.0f} ms of {e}" if e in times else f"{least:.0%} of {e}"
+        for e, least in MATTERS.items()
+    ]
+    text = f"It matters from {', '.join(sizes)} on, or where predictions get worse without it."
+    return text.replace("_", " ").replace("%", " %")
 
 
 def meaning_of(name: str, quantity: Quantity, report: Report) -> str:
@@ -52,11 +64,11 @@ def meaning_of(name: str, quantity: Quantity, report: Report) -> str:
     if not quantity.differs:
         return "as in the simulator"
     if quantity.effect in report.named or moves(name, report.named):
-        return MATTERS[0]
+        return DIFFERS[0]
     if not report.identification.trustworthy:
         return "differs, but is not trusted"
     if quantity.effect in report.departures:
-        return MATTERS[1]
+        return DIFFERS[1]
     if report.reference:
         return "differs from the simulator"
     return "differs too little to matter"
