@@ -46,6 +46,16 @@ def rates(policy: str, judge: str) -> dict[str, float]:
     return row["capture_rate"]
 
 
+def curve(policy: str) -> list[dict]:
+    """What it catches over the steps of evaders that learn against it."""
+    return read("judged")["curves"][f"{policy}, nominal"]
+
+
+def billions(point: dict) -> str:
+    """Steps of each learner."""
+    return f"{point['steps'] / 1e9:.2g}"
+
+
 def worst(rate: dict[str, float]) -> float:
     """The least of the six layouts."""
     return min(rate[layout] for layout in SCENARIOS)
@@ -69,23 +79,28 @@ def judged() -> str:
 def members() -> str:
     """Why the default policy is two: each member alone against evaders that learned."""
     alone = [worst(rates(f"{DEFAULT_POLICY}, member {n}", LEARNED)) for n in (1, 2)]
-    both = worst(rates(DEFAULT_POLICY, LEARNED))
+    first = curve(DEFAULT_POLICY)[0]
+    both = worst(first["capture_rate"])
     return textwrap.fill(
         f"`{DEFAULT_POLICY}` is two policies, and the team switches between them at random every "
-        "0.4 s. Against evaders that learned, it catches "
-        f"{both:.2f} in the worst layout. Alone, its two members catch {alone[0]:.2f} and "
-        f"{alone[1]:.2f}.",
+        f"0.4 s. Against evaders that learned {billions(first)} billion steps each, it catches "
+        f"{both:.2f} in the worst layout. Alone, and against evaders of fewer steps, its two "
+        f"members catch {alone[0]:.2f} and {alone[1]:.2f}.",
         WIDTH,
     )
 
 
 def hold() -> str:
     """How often the default policy catches the hardest evaders."""
-    learned, planner = (rates(DEFAULT_POLICY, judge) for judge in (LEARNED, PLANNER))
+    points = curve(DEFAULT_POLICY)
+    first, last = (point["capture_rate"] for point in (points[0], points[-1]))
+    planner = rates(DEFAULT_POLICY, PLANNER)
     return textwrap.fill(
-        f"`{DEFAULT_POLICY}` catches the hardest of eight evaders that learned against it in "
-        f"{learned['uniform']:.2f} of uniform tasks, and in {worst(learned):.2f} of the episodes "
-        "of its worst layout. It catches an evader that plans in the true simulation in "
+        f"`{DEFAULT_POLICY}` catches the hardest evader that learned against it for "
+        f"{billions(points[0])} billion steps in {first['uniform']:.2f} of uniform tasks, and in "
+        f"{worst(first):.2f} of the episodes of its worst layout. After {billions(points[-1])} "
+        f"billion steps it is {last['uniform']:.2f} and {worst(last):.2f}. It catches "
+        "an evader that plans in the true simulation in "
         f"{planner['uniform']:.2f} of uniform tasks, and in {worst(planner):.2f} of its worst "
         "layout.",
         WIDTH,

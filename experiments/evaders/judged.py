@@ -93,6 +93,8 @@ def study(options) -> dict:
     return {**kept, "rows": rows, "runs": runs, "curves": curves}
 
 
+TRIED = "tried: "
+"""How the names of policies begin that are no weights of the project."""
 SHOWN = 250_000_000
 """Steps of each learner whose row is on the page, beside those of the end."""
 
@@ -102,6 +104,8 @@ def page(results: Mapping) -> Page:
     rows = []
     for name, points in results["curves"].items():
         policy = name.removesuffix(", nominal")
+        if policy.startswith(TRIED) or policy == name:
+            continue  # other vehicles, and what is told in a line
         near = min(points, key=lambda point: abs(point["steps"] - SHOWN))
         shown = [near] if near is points[-1] else [near, points[-1]]
         rows += [
@@ -130,8 +134,12 @@ def page(results: Mapping) -> Page:
 
 def draw(results: Mapping, path: Path) -> None:
     """The curves."""
-    curves = results["curves"].items()
-    draw_curves(path, {name.removesuffix(", nominal"): points for name, points in curves})
+    curves = {
+        name.removesuffix(", nominal"): points
+        for name, points in results["curves"].items()
+        if name.endswith(", nominal")
+    }
+    draw_curves(path, curves)
 
 
 def main(arguments: list[str]) -> None:
