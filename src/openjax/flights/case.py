@@ -23,6 +23,8 @@ from openjax.flights.importers import (
 )
 from openjax.flights.plausible import wrong_mass
 from openjax.flights.reading import LogError, flights_of
+from openjax.flights.together import Logs, join
+from openjax.vehicle.parameters import NOMINAL
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 
 NO_LOGS = ("vehicle.toml", MAPPING_FILE)
@@ -38,15 +40,15 @@ class LogFolder:
     vehicle_file: VehicleFile
     """Of the nominal vehicle where the folder has none."""
     has_vehicle_file: bool
-    logs: tuple[tuple[list[Flight], list[Issue]], ...]
-    """The flights of each log, and what was found while it was read."""
+    logs: Logs
 
     def case(self, comparison: bool = False) -> Case:
         """Checked, as `load_case` says."""
         if not self.has_vehicle_file and not comparison:
             raise TooLittle(f"{self.path}: no vehicle.toml; {_called_otherwise(self.path)}")
-        flights, issues = _usable(self.logs, self.vehicle_file, comparison)
-        issues += _not_flown(self.vehicle_file, self.logs)
+        vehicle_file, logs, issues = _with_motor_commands(self.vehicle_file, self.logs)
+        flights, findings = _usable(logs, vehicle_file, comparison)
+        issues += [*findings, *_not_flown(vehicle_file, self.logs)]
         if not flights:
             reasons = [i for i in issues if i.refused]
             first = (
@@ -56,8 +58,8 @@ class LogFolder:
             raise TooLittle(f"{self.path}: no flight can be used: {first}{more}")
         # A thrust error is told from the mass only where every vehicle that flew was
         # weighed.
-        is_weighed = all(self.vehicle_file.mass_weighed_of(flight.vehicle) for flight in flights)
-        vehicle_file = replace(self.vehicle_file, mass_weighed=is_weighed)
+        is_weighed = all(vehicle_file.mass_weighed_of(flight.vehicle) for flight in flights)
+        vehicle_file = replace(vehicle_file, mass_weighed=is_weighed)
         name = self.path.resolve().name
         return Case(name, tuple(flights), vehicle_file, tuple(issues), self.path)
 
@@ -86,8 +88,34 @@ def read_folder(path: str | Path, dtype=jnp.float32) -> LogFolder:
     has_vehicle_file = (path / "vehicle.toml").exists()
     vehicle_file = load_vehicle_file(path / "vehicle.toml" if has_vehicle_file else None, dtype)
     mapping = load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
-    logs_read = tuple(_read(log, vehicle_file, mapping) for log in logs)
-    return LogFolder(path, vehicle_file, has_vehicle_file, logs_read)
+    logs_read, issues = join(tuple(_read(log, vehicle_file, mapping) for log in logs))
+    return LogFolder(path, vehicle_file, has_vehicle_file, (*logs_read, ([], issues)))
+
+
+def _with_motor_commands(
+    vehicle_file: VehicleFile, logs: Logs
+) -> tuple[VehicleFile, Logs, list[Issue]]:
+    """The vehicle file with what its motors' commands are, the logs that they are so in,
+    and what was found: where it doesn't say, the logs' format may.
+    """
+    if vehicle_file.motor.command is not None:
+        return vehicle_file, logs, []
+    with_motors = [f for flights, _ in logs for f in flights if f.motor_command is not None]
+    # the public map from duty cycles to thrust is that of the brushed vehicle
+    duty = {f.log for f in with_motors if f.duty_cycles and vehicle_file.airframe == NOMINAL}
+    shares = {f.log for f in with_motors} - duty
+    command = "pwm" if duty and not shares else "thrust"
+    vehicle_file = replace(vehicle_file, motor=replace(vehicle_file.motor, command=command))
+    if command == "pwm":
+        words = 'motors are duty cycles, as the firmware logs them: motor.command = "pwm"'
+        return vehicle_file, logs, [Issue("vehicle.toml", words, kind="motors")]
+    words = "motors are duty cycles, and shares of the thrust in other logs: two cases, or say "
+    issues = [
+        Issue(log, f"{words}motor.command in vehicle.toml", refused=True, kind="motors")
+        for log in sorted(duty)
+    ]
+    rest = tuple(([f for f in of_log if f.log not in duty], findings) for of_log, findings in logs)
+    return vehicle_file, rest, issues
 
 
 def _not_flown(vehicle_file: VehicleFile, logs_read) -> list[Issue]:

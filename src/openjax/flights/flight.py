@@ -84,6 +84,10 @@ class Flight:
     battery_voltage: Array | None = None  # (T,) V, under load
     # True: differentiated from position by the reader, not logged
     velocity_derived: bool = False
+    # what the log's format says of its motors, where it says anything
+    duty_cycles: bool = False
+    # s that the log's clock read at time 0; None: it is the vehicle's own
+    clock_start: float | None = None
     body_rates_derived: bool = (
         False  # True: differentiated from the attitude by the reader, no gyroscope
     )

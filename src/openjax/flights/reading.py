@@ -34,6 +34,12 @@ class LogTable:
     """(R,) ids."""
     remarks: tuple[str, ...] = field(default=())
     """What was found while reading and doesn't stop it."""
+    duty_cycles: bool = False
+    """Whether the format says that m1 to m4 are duty cycles."""
+    clock_start: float | None = None
+    """What the log's clock read at t = 0, s: since 1970, or since the flight's start; None
+    for a clock of the vehicle's own.
+    """
 
 
 def flights_of(
@@ -69,9 +75,9 @@ def flights_of(
         arrays = {c: v[rows] for c, v in channels.items() if not np.isnan(v[rows]).all()}
         name = table.name if len(ids) == 1 else f"{table.name}:{vehicle_id}"
         time = table.columns["t"][rows]
-        flights.append(
-            Flight(name, table.name, vehicle_id, time, fingerprint=fingerprint, **arrays)
-        )
+        facts = {n: getattr(table, n) for n in ("duty_cycles", "clock_start")}
+        facts["fingerprint"] = fingerprint
+        flights.append(Flight(name, table.name, vehicle_id, time, **facts, **arrays))
     return flights, remarks
 
 

@@ -48,7 +48,8 @@ class VehicleTable(Overrides):
 class Motor:
     """`[motor]`: what the logged columns m1 to m4 mean."""
 
-    command: Literal["thrust", "pwm"] = "thrust"
+    command: Literal["thrust", "pwm"] | None = None
+    """None: what the log's format says, and else "thrust"."""
     order: tuple[Place, Place, Place, Place] = NOMINAL_ORDER
     spin: tuple[Spin, Spin, Spin, Spin] | None = None
     """None: that of the nominal vehicle's rotors at these places."""

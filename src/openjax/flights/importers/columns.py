@@ -156,8 +156,10 @@ class ColumnMapping:
             if "t" in self.columns:
                 absent = f"{self.columns['t'].name!r}, which {MAPPING_FILE} names for t"
             raise LogError(f"no column {absent}; the log has {', '.join(raw.columns)}")
-        columns["t"] = columns["t"] - np.nanmin(columns["t"])
-        return LogTable(name, with_quaternion(columns), raw.vehicle, tuple(remarks))
+        start = float(np.nanmin(columns["t"]))
+        columns["t"] = columns["t"] - start
+        columns = with_quaternion(columns)
+        return LogTable(name, columns, raw.vehicle, tuple(remarks), clock_start=start)
 
 
 def with_units(mapping: ColumnMapping | None, names: list[str]) -> ColumnMapping:

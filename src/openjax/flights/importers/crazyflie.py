@@ -20,7 +20,12 @@ from openjax.flights.importers.csv_files import (
     raw_columns,
     seconds_per_unit,
 )
-from openjax.flights.importers.firmware import VARIABLES, firmware_columns, with_mixer
+from openjax.flights.importers.firmware import (
+    VARIABLES,
+    are_duty_cycles,
+    firmware_columns,
+    with_mixer,
+)
 from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import LogError, LogTable
 
@@ -29,6 +34,7 @@ GROUPS = ("stateEstimate", "stateEstimateZ", "stabilizer", "kalman", "gyro", "ac
 """Of log variables whose names no other program has; other programs have a `motor.m1`,
 too.
 """
+SINCE_1970 = 1e9  # s, from which stamps count since then
 SELDOM = 2000.0  # ms between rows: the slowest log block of the firmware has 2550
 
 
@@ -82,8 +88,13 @@ def read_client_log(path: Path, mapping: ColumnMapping | None = None) -> LogTabl
         remarks += more_remarks
     columns, more_remarks = firmware_columns(streams, mapping)
     table = merge_streams(streams, columns)
-    table["t"] = table["t"] - table["t"][0]
-    return LogTable(path.name, table, np.full(len(table["t"]), "0"), (*remarks, *more_remarks))
+    start = float(table["t"][0])
+    table["t"] = table["t"] - start
+    # a computer's clock; ticks count from when the vehicle was switched on
+    clock_start = start if start > SINCE_1970 else None
+    vehicle = np.full(len(table["t"]), "0")
+    remarks = (*remarks, *more_remarks)
+    return LogTable(path.name, table, vehicle, remarks, are_duty_cycles(columns), clock_start)
 
 
 def _block(path: Path, mapping: ColumnMapping | None) -> tuple[Stream, list[str]]:

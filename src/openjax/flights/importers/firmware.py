@@ -45,6 +45,13 @@ def firmware_columns(
     return columns, remarks
 
 
+def are_duty_cycles(columns: dict[str, Source]) -> bool:
+    """Whether the motors' columns are what the firmware's motors got: duty cycles, behind
+    the battery compensation. The mixer's outputs are before it.
+    """
+    return columns.get("m1", Source("")).name in ("motor.m1", "pwm.m1_pwm")
+
+
 def with_mixer(stream: Stream) -> Stream:
     """The stream with `mixer.m1` to `mixer.m4`, 0 to 65535, where it holds the mixer's
     four inputs: what the firmware's legacy power distribution

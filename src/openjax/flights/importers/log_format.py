@@ -1,5 +1,6 @@
 """CSV files of the log format, and any others whose columns a `columns.toml` names."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from openjax.flights.csv_table import read_csv
@@ -14,7 +15,7 @@ def read_log_format(path: Path, mapping: ColumnMapping | None = None) -> LogTabl
     """A CSV as a table. Raises LogError where it can't be read."""
     mapping = with_units(mapping, header_of(path, delimiter_of(mapping)))
     if not mapping.columns:
-        return read_csv(path)
+        return replace(read_csv(path), clock_start=0.0)
     if mapping.clocks:
         return read_topic_times(path, mapping)
     table = read_csv(path, mapping.delimiter, mapping.names(), mapping.time)

@@ -21,7 +21,7 @@ import numpy as np
 from openjax.flights.csv_text import LARGEST, LogError
 from openjax.flights.importers.columns import ColumnMapping, Stream, merge_streams
 from openjax.flights.importers.csv_files import seconds_per_unit
-from openjax.flights.importers.firmware import firmware_columns, with_mixer
+from openjax.flights.importers.firmware import are_duty_cycles, firmware_columns, with_mixer
 from openjax.flights.importers.importer import Importer
 from openjax.flights.reading import LogTable
 
@@ -62,7 +62,8 @@ def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> Log
     remarks += more_remarks
     table = merge_streams(streams, columns)
     table["t"] = table["t"] - table["t"][0]
-    return LogTable(path.name, table, np.full(len(table["t"]), "0"), tuple(remarks))
+    vehicle = np.full(len(table["t"]), "0")
+    return LogTable(path.name, table, vehicle, tuple(remarks), are_duty_cycles(columns))
 
 
 def decode(data: bytes) -> tuple[list[Stream], list[str]]:

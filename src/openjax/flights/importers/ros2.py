@@ -7,7 +7,7 @@ where they have one, else the bag's receive times.
 """
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +121,7 @@ def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable
     try:
         with AnyReader(_files_of(path), default_typestore=store) as reader:
             vehicles, remarks = _vehicles(reader, mapping, path)
+            start = 1e-9 * reader.start_time
     except LogError:
         raise
     except Exception as error:  # the library raises many kinds for a damaged bag; all mean the same
@@ -128,7 +129,11 @@ def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable
             f"ROS bag can't be read: {str(error).splitlines()[0] if str(error) else type(error)}"
         ) from error
     tables, remarks = _merge(vehicles, remarks, mapping)
-    return _join(path.name, tables, remarks)
+    # the firmware's variables go before topics
+    of_firmware = [stream for v in vehicles.values() for stream in v.log_streams]
+    duty_cycles = any("motor.m1" in stream.values for stream in of_firmware)
+    table = _join(path.name, tables, remarks)
+    return replace(table, duty_cycles=duty_cycles, clock_start=start + table.clock_start)
 
 
 @dataclass(eq=False)
@@ -331,7 +336,7 @@ def _join(name: str, tables: dict[str, dict[str, np.ndarray]], remarks: list[str
     }
     columns["t"] = columns["t"] - start
     vehicle = np.concatenate([np.full(len(t["t"]), v) for v, t in tables.items()])
-    return LogTable(name, columns, vehicle, tuple(remarks))
+    return LogTable(name, columns, vehicle, tuple(remarks), clock_start=float(start))
 
 
 IMPORTER = Importer("ROS bag", is_bag, read_bag)

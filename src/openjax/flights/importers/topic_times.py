@@ -85,7 +85,7 @@ def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTab
     clock_of = _clocks(sources, stamps, mapping)
     columns_read = (*stamps.values(), *(source.name for source in sources.values()))
     raw, remarks = raw_columns(path, columns_read, next(iter(stamps.values())), delimiter)
-    streams = _streams(raw, sources, clock_of, mapping)
+    streams, begin = _streams(raw, sources, clock_of, mapping)
     if repeats:
         remarks.append(
             f"columns that others hold already are left out, {repeats[0]} to "
@@ -98,8 +98,10 @@ def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTab
     if mapping is not None and not mapping.clocks and len(clocks) > 1:
         remarks.append(f"each topic's columns are at its own times: {', '.join(clocks)}")
     table = merge_streams(streams, sources)
+    start = begin + float(table["t"][0])
     table["t"] = table["t"] - table["t"][0]
-    return LogTable(path.name, table, np.full(len(table["t"]), "0"), tuple(remarks))
+    vehicle = np.full(len(table["t"]), "0")
+    return LogTable(path.name, table, vehicle, tuple(remarks), clock_start=start)
 
 
 def _map(names: list[str], mapping: ColumnMapping) -> dict[str, Source]:
@@ -174,9 +176,9 @@ def _clocks(sources, stamps: dict[str, str], mapping: ColumnMapping | None) -> d
     return clock_of
 
 
-def _streams(raw, sources, clock_of: dict[str, str], mapping) -> list[Stream]:
-    """A stream for each time stamp in use, in seconds since the first of any; rows that
-    repeat a stamp hold nothing new.
+def _streams(raw, sources, clock_of: dict[str, str], mapping) -> tuple[list[Stream], float]:
+    """A stream for each time stamp in use, in seconds since the first of any, and when
+    that was; rows that repeat a stamp hold nothing new.
     """
     clocks = [clock for clock in dict.fromkeys(clock_of.values()) if clock in raw]
     units = {} if mapping is None else {c.source.name: c.source.scale for c in mapping.clocks}
@@ -202,7 +204,7 @@ def _streams(raw, sources, clock_of: dict[str, str], mapping) -> list[Stream]:
             )
         mine = {sources[c].name for c, k in clock_of.items() if k == clock} & set(raw)
         streams.append(Stream(time[rows], {name: raw[name][rows] for name in mine}))
-    return streams
+    return streams, start
 
 
 IMPORTER = Importer("CSV with a time stamp for each topic", has_topic_times, read_topic_times)
