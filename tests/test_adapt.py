@@ -3,7 +3,6 @@ what is refused.
 """
 
 import json
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +12,17 @@ import pytest
 from openjax.commands import adapt, adapt_policy
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, build
-from openjax.learning.adaptation import make_adaptation, off_the_flight
-from openjax.learning.adapting_game import adapting_game, bounds_of, starting_parameters
-from openjax.learning.fine_tuning import Look, fine_tune, improves
-from openjax.learning.nominal_flights import LAG
+from openjax.learning.gradient.adaptation import (
+    LAG,
+    Look,
+    adapting_game,
+    bounds_of,
+    fine_tune,
+    improves,
+    make_adaptation,
+    off_the_flight,
+    starting_parameters,
+)
 from openjax.learning.settings import AdaptSettings, GeneratorSettings, MappoSettings
 from openjax.policy import NetworkSettings, PolicyParameters, PredictorSettings
 from openjax.pursuit import PursuitSettings
@@ -96,12 +102,11 @@ def test_the_best_step_on_the_way_is_kept():
     after the third.
     """
     policy = PolicyParameters(actor=np.zeros(1), critic={}, predictor=np.zeros(1))
-    adaptation = SimpleNamespace(
-        settings=AdaptSettings(updates=6, look_every=1),
-        fly=lambda parameters, key, bounds: None,
-        optimiser=SimpleNamespace(init=lambda actor: None),
-        update=lambda actor, *_: (actor.replace(parameters=actor.parameters + 1.0), {}),
-    )
+    settings = AdaptSettings(updates=6, look_every=1)
+
+    def updates():
+        for update in range(1, 7):
+            yield policy.replace(actor=np.full(1, float(update))), {}
 
     def worth(parameters):
         score = -((float(parameters.actor[0]) - 3.0) ** 2)
@@ -110,10 +115,9 @@ def test_the_best_step_on_the_way_is_kept():
     def worse_later(parameters):
         return Look(-parameters.actor, np.zeros(1))
 
-    key = jax.random.key(0)
-    tuned = fine_tune(adaptation, policy, np.zeros((1, 4)), key, worth)
+    tuned = fine_tune(updates(), settings, policy, worth)
     assert tuned.update == 3 and tuned.parameters.actor[0] == 3.0 and len(tuned.looks) == 7
-    worse = fine_tune(adaptation, policy, np.zeros((1, 4)), key, worse_later)
+    worse = fine_tune(updates(), settings, policy, worse_later)
     assert worse.update == 0 and worse.parameters.actor[0] == 0.0
 
 
@@ -145,8 +149,9 @@ def test_moments_in_flight_are_the_nominal_vehicles_with_a_settled_other_one(
     adaptation = make_adaptation(loaded.settings, AdaptSettings(worlds=2))
     parameters = starting_parameters(loaded.parameters, loaded.settings)
     bounds = bounds_of({"mass": {"extra": 0.008}}, {}, rest=0.0)
-    flights = adapt_policy.fly(parameters, jax.random.key(0), bounds)
-    nominal = adaptation.fly(parameters, jax.random.key(0), bounds_of({}, {}, rest=0.0))
+    fly = jax.jit(adaptation.nominal_flights)
+    flights = fly(parameters, jax.random.key(0), bounds)
+    nominal = fly(parameters, jax.random.key(0), bounds_of({}, {}, rest=0.0))
     own = flights.state.drones
     other = nominal.state.drones
     np.testing.assert_array_equal(own.position, other.position)

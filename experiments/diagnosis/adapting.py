@@ -120,8 +120,11 @@ class Tuner:
 
         from openjax.commands.adapt_policy import compile_programs
         from openjax.evaluation.validation import uniform_tasks
-        from openjax.learning.adaptation import make_adaptation
-        from openjax.learning.adapting_game import bounds_of, starting_parameters
+        from openjax.learning.gradient.adaptation import (
+            bounds_of,
+            make_adaptation,
+            starting_parameters,
+        )
         from openjax.learning.settings import AdaptSettings
         from openjax.store.policies import load_policy
 
@@ -139,7 +142,7 @@ class Tuner:
         self.key = jax.random.key(seed)
         self.before = starting_parameters(loaded.parameters, loaded.settings)
         self.nominal = bounds_of({}, {}, rest=0.0)
-        self.evaluate, ready = compile_programs(
+        self.evaluate, self.learn, ready = compile_programs(
             self.adaptation, self.before, self.tasks[0], self.nominal
         )
         ready()
@@ -157,7 +160,7 @@ class Tuner:
     def tuned(self, bounds):
         """The policy fine-tuned to vehicles of the bounds, as `openjax adapt` does."""
         from openjax.commands.adapt_policy import look_of
-        from openjax.learning.fine_tuning import fine_tune
+        from openjax.learning.gradient.adaptation import fine_tune
 
         usual = self.fly(self.before, self.nominal, 0)
         steps = self.adaptation.game.episode_length
@@ -165,12 +168,13 @@ class Tuner:
         def look(parameters):
             return look_of(self.fly(parameters, bounds, 0), usual, steps)
 
-        return fine_tune(self.adaptation, self.before, bounds, self.key, look)
+        updates = self.learn(self.before, self.key, bounds)
+        return fine_tune(updates, self.adaptation.settings, self.before, look)
 
 
 def bounds_in(folder: Path, name: str):
     """(R, 4) bounds of an effects file; the true vehicle's hold it alone."""
-    from openjax.learning.adapting_game import bounds_of
+    from openjax.learning.gradient.adaptation import bounds_of
     from openjax.vehicle.effects.effects_file import load_effects, load_intervals
 
     _, values = load_effects(folder / f"{name}.toml")

@@ -136,7 +136,7 @@ def test_plans_end_by_the_evaders_own_rule_and_refined_ones_keep_their_speed():
     settings = PlannerSettings(plans=20, refined=0.5, own_rule=0.5)
     planner = Planner(settings, Duel(GAME, Team(straight)))
     last = jnp.broadcast_to(jnp.array([0.0, 0.6, 0.8]), (2, settings.pieces, 3))
-    plans = np.asarray(jax.jit(planner.candidates)(jax.random.key(0), last))
+    plans = np.asarray(jax.jit(planner.search.candidates)(jax.random.key(0), last))
     assert plans.shape == (2, 20, settings.pieces, 3)
     is_own = np.isnan(plans).all(-1)
     np.testing.assert_array_equal(is_own, np.isnan(plans).any(-1))
@@ -153,8 +153,8 @@ def test_a_value_counts_at_the_end_of_a_plan_unless_it_was_caught():
     statistics = state.statistics
     caught = dataclasses.replace(statistics, captured=jnp.bool_(True), capture_step=state.step + 3)
     duel = Duel(GAME, Team(straight))
-    plain = Planner(PlannerSettings(), duel)
-    valued = Planner(PlannerSettings(), duel, value=lambda state: 9.0)
+    plain = Planner(PlannerSettings(), duel).search
+    valued = Planner(PlannerSettings(), duel, value=lambda state: 9.0).search
     for end, free in ((state, 80 + 9), (state.replace(statistics=caught), 3)):
         room = plain.promise(state, end) - plain.free_steps(state, end)
         np.testing.assert_allclose(valued.promise(state, end) - room, free, atol=1e-4)

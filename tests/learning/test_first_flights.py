@@ -11,15 +11,17 @@ import jax.numpy as jnp
 import pytest
 
 from openjax.learning import preset
-from openjax.learning.first_flights import FirstFlights, first_game, make_first_flights
-from openjax.learning.settings import FirstFlightsSettings
-from openjax.learning.smooth_measures import (
+from openjax.learning.gradient.first_flights import FirstFlights, first_game
+from openjax.learning.gradient.measures import (
+    SmoothFlight,
     crash_share,
     evader_distance,
     free_share,
     nearest_distance,
     tip_share,
 )
+from openjax.learning.gradient.stage import GradientStage
+from openjax.learning.settings import FirstFlightsSettings
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings
 from openjax.pursuit.shortest_paths import shortest_paths
@@ -55,31 +57,31 @@ def test_pursuers_come_nearer():
         NetworkSettings(features=16, heads=1, squash="sample"),
         PredictorSettings(enabled=False),
     )
-    flights = FirstFlights(how, environment, policy)
+    stage = GradientStage(FirstFlights(how, SmoothFlight(environment, policy)))
     observation, _ = jax.jit(environment.reset)(jax.random.key(0))
-    carry = jax.jit(flights.begin)(
-        jax.jit(policy.init)(jax.random.key(1), observation), jax.random.key(2)
-    )
-    some = jax.jit(make_first_flights(flights, 20))
+    parameters = jax.jit(policy.init)(jax.random.key(1), observation)
+    carry = jax.jit(stage.begin)(parameters, jax.random.key(2))
+    some = jax.jit(stage.several(20))
     distances = []
     for done in range(0, 120, 20):
-        carry, parts = some(carry, jax.random.key(3), done)
+        carry, parts = some(carry, parameters, jax.random.key(3), done)
         assert all(jnp.isfinite(value) for value in parts.values())
         distances.append(float(parts["distance"]))
     assert distances[-1] < 0.75 * distances[0]
     # nobody is caught yet: penalties wait
-    assert carry.ramp == 0.0
+    assert carry.lesson.ramp == 0.0
 
 
 def test_a_game_without_pillars_can_be_learnt():
     how = FirstFlightsSettings(updates=1, worlds=2, steps=2)
     environment = first_game(Pursuit(dataclasses.replace(GAME, max_pillars=0)), how)
     networks = NetworkSettings(features=8, heads=1), PredictorSettings(enabled=False)
-    flights = FirstFlights(how, environment, Policy.for_environment(environment, *networks))
+    flight = SmoothFlight(environment, Policy.for_environment(environment, *networks))
+    stage = GradientStage(FirstFlights(how, flight))
 
     def learn(key):
-        observation, _ = environment.reset(key)
-        return flights.update(flights.begin(flights.policy.init(key, observation), key), key)[1]
+        parameters = flight.policy.init(key, environment.reset(key)[0])
+        return stage.several(1)(stage.begin(parameters, key), parameters, key, 0)[1]
 
     assert "distance" in jax.eval_shape(learn, jax.random.key(0))
 
@@ -89,27 +91,31 @@ def test_two_devices_learn_what_one_does():
     how = FirstFlightsSettings(updates=2, worlds=4, steps=2, anew=0.5)
     environment = first_game(Pursuit(GAME), how)
     networks = NetworkSettings(features=8, heads=1), PredictorSettings(enabled=False)
-    one = FirstFlights(how, environment, Policy.for_environment(environment, *networks))
-    two = dataclasses.replace(one, axis="devices")
+    flight = SmoothFlight(environment, Policy.for_environment(environment, *networks))
+    one = GradientStage(FirstFlights(how, flight))
+    two = GradientStage(FirstFlights(how, flight, axis="devices"))
     observation, _ = jax.jit(environment.reset)(jax.random.key(0))
-    parameters = jax.jit(one.policy.init)(jax.random.key(1), observation)
+    parameters = jax.jit(flight.policy.init)(jax.random.key(1), observation)
     key = jax.random.key(2)
 
     @jax.jit
     def both(parameters, key):
         shares = functools.partial(jax.vmap, axis_name="devices", axis_size=2)
-        mine = one.update(one.begin(parameters, key), key)
-        return mine, shares(lambda: two.update(two.begin(parameters, key), key), in_axes=())()
+
+        def learn(stage):
+            return stage.several(1)(stage.begin(parameters, key), parameters, key, 0)
+
+        return learn(one), shares(lambda: learn(two), in_axes=())()
 
     (carry, parts), (their_carry, their_parts) = both(parameters, key)
     for leaf, theirs in zip(
-        jax.tree.leaves(carry.world), jax.tree.leaves(their_carry.world), strict=True
+        jax.tree.leaves(carry.lesson.world), jax.tree.leaves(their_carry.lesson.world), strict=True
     ):
         if leaf.dtype == jnp.float32:
             assert jnp.allclose(leaf, theirs.reshape(leaf.shape), atol=1e-5)
     for leaf, theirs in zip(
-        jax.tree.leaves((carry.parameters.actor, parts)),
-        jax.tree.leaves((their_carry.parameters.actor, their_parts)),
+        jax.tree.leaves((carry.actor.parameters, parts)),
+        jax.tree.leaves((their_carry.actor.parameters, their_parts)),
         strict=True,
     ):
         assert jnp.allclose(theirs, leaf, atol=1e-5)

@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 
 from openjax.learning import TrainSettings, build, changed, make_start, make_training_step
-from openjax.learning.analytic_gradient import AnalyticGradient, free_flight
-from openjax.learning.first_flights import FirstFlights, first_game
+from openjax.learning.gradient.first_flights import FirstFlights, first_game
+from openjax.learning.gradient.last_flights import LastFlights
+from openjax.learning.gradient.measures import SmoothFlight, free_flight
+from openjax.learning.gradient.stage import GradientStage
+from openjax.learning.gradient.worst_plans import WorstPlans, planning_game
 from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings, WorstPlansSettings
-from openjax.learning.worst_plans import WorstPlans, planning_game
 
 SETTINGS = changed(
     TrainSettings(),
@@ -55,34 +57,35 @@ def test_a_training_step_of_teams_keeps_its_carry():
 def test_stages_by_the_gradient_take_teams():
     parts = build(SETTINGS)
     worlds = FirstFlightsSettings(updates=1, worlds=4, steps=2)
-    flights = FirstFlights(worlds, first_game(parts.environment, worlds), parts.policy)
+    game = first_game(parts.environment, worlds)
+    stage = GradientStage(FirstFlights(worlds, SmoothFlight(game, parts.policy)))
 
     def first(key):
-        observation = parts.environment.reset(key)[0]
-        carry = flights.begin(parts.policy.init(key, observation), key)
-        return flights.update(carry, key)[1], carry.world
+        parameters = parts.policy.init(key, parts.environment.reset(key)[0])
+        carry = stage.begin(parameters, key)
+        return stage.several(1)(carry, parameters, key, 0)[1], carry.lesson.world
 
     shares, world = jax.eval_shape(first, jax.random.key(0))
     assert shares["breaches"].shape == () and world[1].task.active.shape == (4, 4)
 
     how = AnalyticSettings(updates=1, worlds=4, draws=1)
-    stage = AnalyticGradient(how, free_flight(parts.environment), parts.policy)
+    lesson = LastFlights(how, SmoothFlight(free_flight(parts.environment), parts.policy))
 
     def last(key):
         parameters = parts.policy.init(key, parts.environment.reset(key)[0])
-        starts = stage.starts(key, stage.bounds())
-        return stage.loss(parameters.actor, parameters, starts, starts)
+        starts = lesson.starts(key, lesson.bounds())
+        return lesson.loss(parameters.actor, parameters, starts, starts)
 
     total, _ = jax.eval_shape(last, jax.random.key(0))
     assert total.shape == () and total.dtype == jnp.float32
 
     planning = WorstPlansSettings(worlds=2, plans=5, pieces=2, unseen=1.0)
     game = planning_game(free_flight(parts.environment))
-    against_plans = WorstPlans(planning, game, stage, SETTINGS.generator)
+    against_plans = WorstPlans(planning, game, lesson, SETTINGS.generator)
 
     def at_the_worst_plan(key):
         parameters = parts.policy.init(key, parts.environment.reset(key)[0])
-        state = against_plans.begin(parameters, key)
+        state = against_plans.begin(key)
         loss = against_plans.loss(parameters.actor, parameters, state.world, state.plan)
         return loss[0]
 

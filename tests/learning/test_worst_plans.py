@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from openjax.learning import AnalyticSettings, GeneratorSettings, build
-from openjax.learning.analytic_gradient import AnalyticGradient, free_flight
-from openjax.learning.gradient_stage import Turn, update
+from openjax.learning.gradient.last_flights import LastFlights
+from openjax.learning.gradient.measures import SmoothFlight, free_flight
+from openjax.learning.gradient.stage import GradientStage, Turn, update
+from openjax.learning.gradient.worst_plans import WARM_UP, WorstPlans, planning_game
 from openjax.learning.presets import preset
 from openjax.learning.settings import WorstPlansSettings
-from openjax.learning.worst_plans import WARM_UP, WorstPlans, planning_game, worst_of
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings
 
@@ -28,14 +29,14 @@ def make_stage(updates):
     policy = Policy.for_environment(
         game, NetworkSettings(features=8, heads=1), PredictorSettings(enabled=False)
     )
-    usual = AnalyticGradient(AnalyticSettings(updates=updates, worlds=4), game, policy)
+    usual = LastFlights(AnalyticSettings(updates=updates, worlds=4), SmoothFlight(game, policy))
     return WorstPlans(HOW, planning_game(game), usual, GeneratorSettings())
 
 
 def test_what_evaders_try():
     stage = dataclasses.replace(make_stage(4), planning=dataclasses.replace(HOW, plans=400))
     plan = jax.random.normal(jax.random.key(0), (5, 3, 3))
-    tried = np.asarray(stage.candidates(jax.random.key(1), plan))
+    tried = np.asarray(stage.search.candidates(jax.random.key(1), plan))
     assert tried.shape == (5, 400, 3, 3)
     np.testing.assert_array_equal(tried[:, 0], plan)
     np.testing.assert_array_equal(tried[:, 1], np.asarray(plan)[:, [1, 2, 2]])
@@ -57,7 +58,7 @@ def test_the_first_steps_are_small():
     for _ in range(2 * WARM_UP):
         change, state = stage.optimiser.update(gradient, state)
         sizes.append(float(jnp.max(jnp.abs(change["weight"]))))
-    rate = stage.settings.learning_rate
+    rate = stage.usual.settings.learning_rate
     assert sizes[0] <= rate / WARM_UP
     assert max(sizes) == pytest.approx(rate, rel=0.05)
     assert np.argmax(sizes) == pytest.approx(WARM_UP, abs=1)
@@ -68,8 +69,8 @@ def flown():
     """A stage, its parameters and what it carries."""
     stage = make_stage(4)
     observation, _ = jax.jit(stage.environment.reset)(jax.random.key(0))
-    parameters = jax.jit(stage.usual.policy.init)(jax.random.key(1), observation)
-    return stage, parameters, jax.jit(stage.begin)(parameters, jax.random.key(2))
+    parameters = jax.jit(stage.flight.policy.init)(jax.random.key(1), observation)
+    return stage, parameters, jax.jit(stage.begin)(jax.random.key(2))
 
 
 @pytest.mark.slow
@@ -77,41 +78,40 @@ def test_the_worst_plan_is_the_worst_of_those_tried(flown):
     stage, parameters, carried = flown
     plan = 0.7 * jax.random.normal(jax.random.key(3), carried.plan.shape)
     key = jax.random.key(4)
-    worst, promised = worst_of(
-        jax.jit(stage.attempts)(parameters.actor, parameters, carried.world, plan, key)
-    )
+    trials = jax.jit(stage.attempts)(parameters.actor, parameters, carried.world, plan, key)
     step = jax.jit(stage.environment.step)
-    act = jax.jit(stage.usual.policy.act)
+    act = jax.jit(stage.flight.policy.act)
     for world in range(HOW.worlds):
         promises = []
-        tried = stage.candidates(key, plan)[world]
+        tried = stage.search.candidates(key, plan)[world]
         for pieces in tried:
             start = jax.tree.map(lambda leaf, world=world: leaf[world], carried.world)
             observation, state = start
-            for wish in jnp.repeat(pieces, stage.piece_steps, axis=0):
+            for wish in jnp.repeat(pieces, stage.search.settings.piece_steps, axis=0):
                 action = act(parameters, observation)
                 observation, state, *_ = step(None, state, action, wish)
-            lead = [jax.tree.map(lambda leaf: leaf[None], one) for one in (start[1], state)]
-            promises.append(float(stage.promise(*lead)[0]))
-        assert promised[world] == pytest.approx(max(promises), abs=1e-3)
-        np.testing.assert_allclose(worst[world], tried[int(np.argmax(promises))], atol=1e-5)
+            promises.append(float(stage.search.promise(start[1], state)))
+        np.testing.assert_allclose(trials.promise[world], promises, atol=1e-3)
+        np.testing.assert_allclose(trials.best[world], tried[int(np.argmax(promises))], atol=1e-5)
 
 
 @pytest.mark.slow
 def test_pursuers_learn_from_the_worst_plan(flown):
-    stage, parameters, carried = flown
+    lesson, parameters, _ = flown
+    stage = GradientStage(lesson)
     one = jax.jit(functools.partial(update, stage.programs))
-    flights = jax.jit(stage.record)(parameters, jax.random.key(5))
-    turn = Turn(parameters.actor, carried, parameters, flights, jax.random.key(6))
-    actor, after, parts = one(turn)
-    assert jax.tree.structure(after) == jax.tree.structure(carried)
+    carry = jax.jit(stage.begin)(parameters, jax.random.key(2))
+    flights = jax.jit(lesson.record)(parameters, jax.random.key(5))
+    turn = Turn(carry, parameters, flights, jax.random.key(6))
+    after, parts = one(turn)
+    assert jax.tree.structure(after) == jax.tree.structure(carry)
     assert all(np.isfinite(value) for value in parts.values())
     # worlds are a piece of the plan later, the plan is what is left of it
-    steps = np.asarray(after.world[1].step)
-    assert set(steps) <= {0, stage.piece_steps}
+    steps = np.asarray(after.lesson.world[1].step)
+    assert set(steps) <= {0, lesson.search.settings.piece_steps}
     # Adam's first step has a rate of zero, the second doesn't
-    actor, *_ = one(turn._replace(actor=actor, state=after, key=jax.random.key(7)))
-    moved = jax.tree.map(lambda a, b: jnp.any(a != b), actor, parameters.actor)
+    after, _ = one(turn._replace(carry=after, key=jax.random.key(7)))
+    moved = jax.tree.map(lambda a, b: jnp.any(a != b), after.actor.parameters, parameters.actor)
     assert any(jax.tree.leaves(moved))
 
 
@@ -121,18 +121,18 @@ def test_the_game_that_is_shipped_can_be_learnt_with_team_plans():
     game = dataclasses.replace(settings.environment, evaders=("field",))
     environment = free_flight(Pursuit(game))
     policy = build(settings, environment).policy
-    usual = AnalyticGradient(settings.analytic, environment, policy)
-    stage = WorstPlans(settings.worst_plans, planning_game(environment), usual, settings.generator)
+    usual = LastFlights(settings.analytic, SmoothFlight(environment, policy))
+    lesson = WorstPlans(settings.worst_plans, planning_game(environment), usual, settings.generator)
+    stage = GradientStage(lesson)
 
     def whole(key):
         parameters = policy.init(key, environment.reset(key)[0])
-        state = stage.begin(parameters, key)
-        flights = stage.record(parameters, key)
-        turn = Turn(parameters.actor, state, parameters, flights, key)
-        return state, update(stage.programs, turn)
+        carry = stage.begin(parameters, key)
+        flights = lesson.record(parameters, key)
+        return carry, update(stage.programs, Turn(carry, parameters, flights, key))
 
     # its shapes alone: vehicles' ranges, say, can't be checked inside a program
-    before, (_, after, parts) = jax.eval_shape(whole, jax.random.key(0))
+    before, (after, parts) = jax.eval_shape(whole, jax.random.key(0))
     assert jax.tree.structure(before) == jax.tree.structure(after)
     assert {"planned_follow", "planned_gain"} <= set(parts)
 

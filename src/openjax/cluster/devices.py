@@ -17,7 +17,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from openjax.errors import UserError
 from openjax.learning import Parts, TrainCarry, TrainSettings, make_training_step
-from openjax.learning.first_flights import FirstCarry, FirstFlights, make_first_flights
+from openjax.learning.gradient.first_flights import FirstFlights, FirstWorlds
+from openjax.learning.gradient.stage import GradientStage, StageCarry
 
 AXIS = "devices"
 _SHARED_OUT = ("observation", "state")
@@ -122,20 +123,24 @@ def make_device_step(settings: TrainSettings, parts: Parts, number: int) -> Call
 def make_device_first_flights(
     flights: FirstFlights, together: int, number: int
 ) -> tuple[Callable, Callable, Any]:
-    """`flights.begin` and `make_first_flights` on `number` devices, not yet compiled;
-    where the leaves of their carry lie.
+    """The stage's `begin`, and `together` of its updates (`GradientStage.several`), on
+    `number` devices, not yet compiled; where the leaves of their carry lie.
     """
     if number == 1:
-        return flights.begin, make_first_flights(flights, together), None
-    flights = dataclasses.replace(flights, axis=AXIS)
+        stage = GradientStage(flights)
+        return stage.begin, stage.several(together), None
+    stage = GradientStage(dataclasses.replace(flights, axis=AXIS))
     same = PartitionSpec()
-    carry = FirstCarry(same, same, PartitionSpec(AXIS), same)
-    begin = _shared_out(number, flights.begin, (same, same), carry)
-    some = _shared_out(
-        number, make_first_flights(flights, together), (carry, same, same), (carry, same)
+    carry = StageCarry(same, FirstWorlds(PartitionSpec(AXIS), same))
+    begin = _shared_out(number, stage.begin, (same, same), carry)
+    some = _shared_out(number, stage.several(together), (carry, same, same, same), (carry, same))
+    mesh = _mesh(number)
+    at = jax.tree.map(
+        lambda spec: NamedSharding(mesh, spec),
+        carry,
+        is_leaf=lambda leaf: isinstance(leaf, PartitionSpec),
     )
-    at = {name: NamedSharding(_mesh(number), spec) for name, spec in vars(carry).items()}
-    return begin, some, FirstCarry(**at)
+    return begin, some, at
 
 
 def compiler_options(number: int, brief: bool = False) -> dict:

@@ -29,10 +29,14 @@ from openjax.evaluation.validation import selection_score, uniform_tasks
 from openjax.files import write_json, write_text
 from openjax.flights.case import load_case
 from openjax.interruption import clean_up
-from openjax.learning.adaptation import make_adaptation
-from openjax.learning.adapting_game import bounds_of, starting_parameters
-from openjax.learning.fine_tuning import Look, fine_tune
-from openjax.learning.train_state import TrainState
+from openjax.learning.gradient.adaptation import (
+    Look,
+    bounds_of,
+    fine_tune,
+    make_adaptation,
+    starting_parameters,
+)
+from openjax.learning.gradient.stage import GradientStage, compile_stage
 from openjax.pursuit import Pursuit
 from openjax.runs.machine import describe_machine
 from openjax.store.policies import load_policy
@@ -136,7 +140,7 @@ class _Programs:
         self._measured_on = jax.tree.map(lambda leaf: leaf[command.episodes :], tasks)
         self._parameters = starting_parameters(self.loaded.parameters, self.loaded.settings)
         self._nominal = bounds_of({}, {}, rest=0.0)
-        self._evaluate, self.ready = compile_programs(
+        self._evaluate, self._learn, self.ready = compile_programs(
             self.adaptation, self._parameters, self._chosen_by, self._nominal
         )
 
@@ -149,7 +153,7 @@ class _Programs:
 
     def fine_tune(self, vehicle: _Diagnosed, tell: Callable[[str], None]):
         """The best of the policy's updates (see
-        `openjax.learning.fine_tuning.fine_tune`); `tell` is told of each look at it.
+        `openjax.learning.gradient.adaptation.fine_tune`); `tell` is told of each look at it.
         """
         # the same draws for all that is compared, here and in each look
         usual = self._fly(self._parameters, self._chosen_by, 1, self._nominal)
@@ -163,7 +167,8 @@ class _Programs:
             episodes = self._fly(policy, self._chosen_by, 1, vehicle.bounds)
             return look_of(episodes, usual, self.game.episode_length)
 
-        return fine_tune(self.adaptation, self._parameters, vehicle.bounds, self._key, look)
+        updates = self._learn(self._parameters, self._key, vehicle.bounds)
+        return fine_tune(updates, self.adaptation.settings, self._parameters, look)
 
     def measure(self, vehicle: _Diagnosed, tuned_parameters) -> dict[str, dict]:
         """Figures (B,) of `WHICH` on tasks that no checkpoint was chosen by."""
@@ -277,18 +282,11 @@ def _diagnosis(command: AdaptCommand) -> Iterator[Callable[[], Path]]:
 
 
 def compile_programs(adaptation, parameters, tasks, bounds):
-    """Start to compile flights, update and evaluation; the evaluation (parameters, tasks,
-    key, bounds), and a function that waits for all.
+    """Start to compile the evaluation (parameters, tasks, key, bounds) and the stage
+    (parameters, key, bounds); both, and a function that waits for them.
     """
     evaluate = jax.jit(make_evaluate_vehicles(Pursuit(adaptation.game), adaptation.policy))
-    key = jax.random.key(0)
-    flights = jax.eval_shape(adaptation.fly, parameters, key, bounds)
-    state = jax.eval_shape(adaptation.optimiser.init, parameters.actor)
-    actor = TrainState(parameters.actor, state)
-    # the update first: it takes longest
-    waits = [
-        compile_ahead(adaptation.update, actor, parameters, flights, key, bounds),
-        compile_ahead(evaluate, parameters, tasks, key, bounds),
-        compile_ahead(adaptation.fly, parameters, key, bounds),
-    ]
-    return evaluate, lambda: [wait() for wait in waits]
+    # the stage first: its update takes longest
+    learn = compile_stage(GradientStage(adaptation), parameters, bounds)
+    wait = compile_ahead(evaluate, parameters, tasks, jax.random.key(0), bounds)
+    return evaluate, learn, lambda: (learn.ready(), wait())

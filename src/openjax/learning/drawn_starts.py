@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, PRNGKeyArray
 
 from openjax.learning.generator import vary_pillars
+from openjax.learning.gradient.measures import nearest_gap
 from openjax.learning.settings import GeneratorSettings
-from openjax.learning.smooth_measures import nearest_gap
 from openjax.pursuit import (
     PursuitSettings,
     PursuitState,

@@ -167,7 +167,7 @@ class EvaderLearningSettings:
 @dataclass(frozen=True)
 class FirstFlightsSettings:
     """The stage before MAPPO by the gradient through the simulation; see
-    `openjax.learning.first_flights`.
+    `openjax.learning.gradient.first_flights`.
     """
 
     updates: Annotated[int, Interval("[0, 1000000]")] = 0
@@ -218,7 +218,7 @@ class FirstFlightsSettings:
 @dataclass(frozen=True)
 class AnalyticSettings:
     """The stage after MAPPO by the gradient through the simulation; see
-    `openjax.learning.analytic_gradient`.
+    `openjax.learning.gradient.last_flights`.
     """
 
     updates: Annotated[int, Interval("[0, 1000000]")] = 0
@@ -255,7 +255,7 @@ class AnalyticSettings:
 @dataclass(frozen=True)
 class WorstPlansSettings:
     """What the last stage learns from evaders' plans; see
-    `openjax.learning.worst_plans`.
+    `openjax.learning.gradient.worst_plans`.
     """
 
     worlds: Annotated[int, Interval("[0, 65536]")] = 0
@@ -295,6 +295,40 @@ class WorstPlansSettings:
 
     def __post_init__(self):
         check_intervals(self, "worst_plans.")
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """Which plans an evader tries; see `openjax.learning.plan_search`."""
+
+    plans: Annotated[int, Interval("[3, 10000]")] = 48
+    """That are tried each time."""
+    pieces: Annotated[int, Interval("[1, 100]")] = 4
+    """Velocities of a plan, one after the other."""
+    piece_steps: Annotated[int, Interval("[1, 1000]")] = 20
+    """Control steps of each velocity: .2 s, so that four see .8 s ahead."""
+    ahead: Annotated[float, Interval("[0, 10]")] = 0.15
+    """Seconds after which pursuers are thought to be where their velocity leads, at a
+    plan's end: about the time in which a vehicle turns its velocity round.
+    """
+    turn: Annotated[float, Interval("[0, 1]")] = 0.5
+    """Odds that a piece of a random plan leads elsewhere than the piece before."""
+    refined: Annotated[float, Interval("[0, 1]")] = 0.0
+    """Share of the plans that are the last best one with some pieces flown a little
+    otherwise.
+    """
+    own_rule: Annotated[float, Interval("[0, 1]")] = 0.0
+    """Share of the random plans that turn after whose first pieces, or none, the evader
+    flies as the strongest of those that learned: it knows what comes after the horizon.
+    """
+
+    def __post_init__(self):
+        check_intervals(self, "planning.")
+
+    @property
+    def steps(self) -> int:
+        """Control steps of a plan."""
+        return self.pieces * self.piece_steps
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ so that 600 pairs of plans cost less than flying the networks against 32; the te
 that is best against the evader's best answer is the one to learn from (a matrix game,
 in which the evader chooses last).
 
-It shares no code with the planners of `openjax.evaluation.judges`, which judge what is
-learnt here.
+It answers the plans of `openjax.learning.plan_search`, which judges use, too; no judge
+knows of the team's.
 """
 
 import dataclasses

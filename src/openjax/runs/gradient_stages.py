@@ -17,10 +17,11 @@ from openjax.cluster.devices import (
     make_device_first_flights,
     own_copy,
 )
-from openjax.learning.analytic_gradient import AnalyticGradient, free_flight
-from openjax.learning.first_flights import FirstFlights, first_game
-from openjax.learning.gradient_stage import compile_stage
-from openjax.learning.worst_plans import WorstPlans, planning_game
+from openjax.learning.gradient.first_flights import FirstFlights, first_game
+from openjax.learning.gradient.last_flights import LastFlights
+from openjax.learning.gradient.measures import SmoothFlight, free_flight
+from openjax.learning.gradient.stage import CompiledStage, GradientStage, compile_stage
+from openjax.learning.gradient.worst_plans import WorstPlans, planning_game
 from openjax.policy import Policy, PolicyParameters
 from openjax.runs.job import TrainingJob
 from openjax.show.progress import duration
@@ -39,8 +40,8 @@ class FirstFlightsProgram:
     begin: Pending
     """Gives (parameters, key) -> the stage's carry."""
     some: Pending
-    """Gives (carry, key, updates done) -> carry, mean parts of the loss; `TOGETHER` updates,
-    or all of fewer.
+    """Gives (carry, parameters before, key, updates done) -> carry, mean parts of the loss;
+    `TOGETHER` updates, or all of fewer.
     """
     places: Any
     """Where its arguments lie: a sharding, None for the first device."""
@@ -65,14 +66,14 @@ class FirstFlightsProgram:
         if over():
             return None
         start = time.monotonic()
-        # a copy, as the first call takes the carry's buffers, and the parameters are
-        # needed below
-        parameters_there, key = place((own_copy(parameters), key), self.places)
-        carry = self.begin()(parameters_there, key)
+        # two copies, as the first call takes the carry's buffers, which may be those that
+        # it begins with
+        before, key = place((own_copy(parameters), key), self.places)
+        carry = self.begin()(place(own_copy(parameters), self.places), key)
         for first in range(0, self.updates, TOGETHER):
             if first and over():
                 break
-            carry, parts = self.some()(carry, key, place(jnp.int32(first), self.places))
+            carry, parts = self.some()(carry, before, key, place(jnp.int32(first), self.places))
             updates_done = min(first + TOGETHER, self.updates)
             # waits for them
             loss = {name: float(value) for name, value in parts.items()}
@@ -83,7 +84,7 @@ class FirstFlightsProgram:
                 f"{loss['free']:.0%} of the time, the nearest pursuer {loss['distance']:.2f} m too "
                 f"far, close to a crash {loss['crashes']:.1%}"
             )
-        return parameters.replace(actor=carry.parameters.actor)
+        return parameters.replace(actor=carry.actor.parameters)
 
 
 def compile_first_flights(
@@ -99,7 +100,8 @@ def compile_first_flights(
     """
     stage = job.settings.first_flights
     game = first_game(job.parts.environment, stage)
-    flights = FirstFlights(stage, game, _exact(job.parts.policy), job.settings.generator)
+    flight = SmoothFlight(game, _exact(job.parts.policy))
+    flights = FirstFlights(stage, flight, job.settings.generator)
     devices = _number_of_devices(policy, stage.worlds)
     places = None if devices == 1 else everywhere(devices)
     begin, some, shardings = make_device_first_flights(
@@ -109,16 +111,17 @@ def compile_first_flights(
     policy, key, updates_done = abstract_like((policy, key, updates_done), places)
     carry = abstract_like(jax.eval_shape(begin, policy, key), shardings)
     if keep is not None and devices == 1:
-        some = keep("first_flights", jax.jit(some), lambda: (carry, key, updates_done), carry=carry)
+        arguments = (carry, policy, key, updates_done)
+        some = keep("first_flights", jax.jit(some), lambda: arguments, carry=carry)
     options = compiler_options(devices, brief=True)
     some = jax.jit(some, donate_argnums=0, compiler_options=options)
     # the larger one first
-    some_ready = compile_ahead(some, carry, key, updates_done)
+    some_ready = compile_ahead(some, carry, policy, key, updates_done)
     begin_ready = compile_ahead(jax.jit(begin, compiler_options=options), policy, key)
     return FirstFlightsProgram(stage.updates, begin_ready, some_ready, places)
 
 
-def compile_last_stage(job: TrainingJob, policy: PolicyParameters) -> Callable | None:
+def compile_last_stage(job: TrainingJob, policy: PolicyParameters) -> CompiledStage | None:
     """The stage after MAPPO, compiled for parameters of these shapes, see `compile_stage`;
     None where the run has none.
     """
@@ -127,16 +130,18 @@ def compile_last_stage(job: TrainingJob, policy: PolicyParameters) -> Callable |
         return None
     environment = job.parts.environment
     exact = _exact(job.parts.policy)
+    analytic = settings.analytic
     if not settings.worst_plans.worlds:
-        stage = AnalyticGradient(settings.analytic, free_flight(environment), exact)
+        flight = SmoothFlight(free_flight(environment), exact, analytic.speed_from)
+        lesson = LastFlights(analytic, flight)
     else:
         # networks that learned with the policy aren't in its file
         names = tuple(name for name in environment.settings.evaders if name != "learned")
         game_settings = dataclasses.replace(environment.settings, evaders=names or ("field",))
         game = free_flight(dataclasses.replace(environment, settings=game_settings))
-        usual = AnalyticGradient(settings.analytic, game, exact)
-        stage = WorstPlans(settings.worst_plans, planning_game(game), usual, settings.generator)
-    return compile_stage(stage, abstract_like(policy))
+        usual = LastFlights(analytic, SmoothFlight(game, exact, analytic.speed_from))
+        lesson = WorstPlans(settings.worst_plans, planning_game(game), usual, settings.generator)
+    return compile_stage(GradientStage(lesson), abstract_like(policy))
 
 
 def _number_of_devices(policy, worlds):

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from openjax.errors import UserError
+from openjax.learning.settings import PlanSettings
 from openjax.ranges import Interval, check_intervals
 
 
@@ -136,37 +137,13 @@ class BestResponseSettings:
 
 
 @dataclass(frozen=True)
-class PlannerSettings:
+class PlannerSettings(PlanSettings):
     """Settings of an evader that plans."""
 
-    plans: Annotated[int, Interval("[3, 10000]")] = 48
-    """That are tried each time."""
-    pieces: Annotated[int, Interval("[1, 100]")] = 4
-    """Velocities of a plan, one after the other."""
-    piece_steps: Annotated[int, Interval("[1, 1000]")] = 20
-    """Control steps of each velocity: .2 s, so that four see .8 s ahead."""
     replan: Annotated[int, Interval("[1, 1000]")] = 10
     """Control steps after which it plans anew."""
-    ahead: Annotated[float, Interval("[0, 10]")] = 0.15
-    """Seconds after which pursuers are thought to be where their velocity leads, at a
-    plan's end: about the time in which a vehicle turns its velocity round.
-    """
-    turn: Annotated[float, Interval("[0, 1]")] = 0.5
-    """Odds that a piece of a random plan leads elsewhere than the piece before."""
-    refined: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the plans that are the last best one with some pieces flown a little
-    otherwise.
-    """
-    own_rule: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the random plans that turn after whose first pieces, or none, the evader
-    flies as the strongest of those that learned: it knows what comes after the horizon.
-    """
-
     learned_value: bool = False
     """Whether a second planner flies, to which the end of a plan is worth as many steps
     as the strongest of those that learned would be free from there, by its own
     estimate.
     """
-
-    def __post_init__(self):
-        check_intervals(self, "planning.")

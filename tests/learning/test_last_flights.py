@@ -11,10 +11,17 @@ import optax
 import pytest
 
 from openjax.learning import AnalyticSettings
-from openjax.learning.analytic_gradient import AnalyticGradient, free_flight
 from openjax.learning.drawn_starts import APART, side_by_side
-from openjax.learning.gradient_stage import compile_stage
-from openjax.learning.smooth_measures import SMOOTH, breach_share, crash_depth, crash_share
+from openjax.learning.gradient.last_flights import LastFlights
+from openjax.learning.gradient.measures import (
+    SMOOTH,
+    SmoothFlight,
+    breach_share,
+    crash_depth,
+    crash_share,
+    free_flight,
+)
+from openjax.learning.gradient.stage import GradientStage, compile_stage
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings, uniform_task
 from openjax.pursuit.collisions import breaches
@@ -52,17 +59,17 @@ def stage():
     how = AnalyticSettings(updates=6, worlds=4, learning_rate=3e-3, hold=0.0)
     environment = free_flight(Pursuit(game))
     observation, _ = jax.jit(environment.reset)(jax.random.key(0))
-    return AnalyticGradient(how, environment, policy), jax.jit(policy.init)(
+    return LastFlights(how, SmoothFlight(environment, policy)), jax.jit(policy.init)(
         jax.random.key(1), observation
     )
 
 
 @pytest.mark.slow
 def test_smooth_breaches_are_those_of_the_game(stage):
-    game = stage[0].game
+    game = stage[0].flight.game
     key = jax.random.split(jax.random.key(2), 3)
     tasks = jax.jit(jax.vmap(lambda key: uniform_task(game, key)))(jax.random.split(key[0], 256))
-    _, state = jax.jit(jax.vmap(stage[0].environment.reset_to))(
+    _, state = jax.jit(jax.vmap(stage[0].flight.environment.reset_to))(
         jax.random.split(key[1], 256), tasks
     )
     position = jax.random.uniform(key[2], (256, 3, 3), minval=-0.6, maxval=0.6) * jnp.array(
@@ -94,7 +101,8 @@ def test_hard_starts_are_those_that_come_nearest(stage):
 
     @jax.jit
     def least(starts):
-        return gradient.fly(parameters.actor, parameters, starts, gradient.steps)[1].least.min(-1)
+        met = gradient.flight.fly(parameters.actor, parameters, starts, gradient.steps)[1]
+        return met.least.min(-1)
 
     bounds = jnp.concatenate([gradient.bounds()] * gradient.settings.draws)
     all_of_them = np.sort(least(gradient.starts(key, bounds)))
@@ -122,7 +130,9 @@ def test_gradient_is_that_of_the_loss_and_learning_follows_it(stage):
         )
 
     assert moved(step) - moved(-step) == pytest.approx(2 * step * steepness, rel=0.1)
-    updates = list(compile_stage(gradient, parameters)(parameters, jax.random.key(4)))
+    updates = list(
+        compile_stage(GradientStage(gradient), parameters)(parameters, jax.random.key(4))
+    )
     assert len(updates) == 6
     assert all(np.isfinite(list(parts.values())).all() for _, parts in updates)
     assert loss(updates[-1][0].actor) < value

@@ -1,15 +1,14 @@
-"""The first stage of a run: to fly, and to go after the evader, by the gradient through
+"""The first lesson of a run: to fly, and to go after the evader, by the gradient through
 the simulation.
 
 From scratch MAPPO spends half of its data on learning to fly. The equations of motion
 teach that in seconds: how far the nearest pursuer is from the evader over the next
-moments has a gradient, and so have near misses (`openjax.learning.analytic_gradient`).
+moments has a gradient, and so have near misses (`last_flights`).
 What has none, waiting or cutting off, is left to MAPPO.
 """
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,20 +18,20 @@ import optax
 from flax import struct
 from jaxtyping import PRNGKeyArray
 
-from openjax.learning.analytic_gradient import AnalyticGradient, free_flight
 from openjax.learning.collectives import mean_over_devices, own_share
 from openjax.learning.drawn_starts import draw_anywhere, is_lost
-from openjax.learning.gradient_step import (
+from openjax.learning.gradient.measures import SmoothFlight, crash_share, free_flight, tip_share
+from openjax.learning.gradient.stage import (
     SLOWEST_RATE,
+    Learnt,
+    Turn,
     clipped_descent,
-    finite_or_zero,
-    renew,
     weighted_sum,
 )
-from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings, GeneratorSettings
-from openjax.learning.smooth_measures import crash_share, tip_share
-from openjax.policy import Policy, PolicyParameters
+from openjax.learning.settings import FirstFlightsSettings, GeneratorSettings
+from openjax.policy import PolicyParameters
 from openjax.pursuit import Pursuit
+from openjax.pursuit.rows import where_rows
 from openjax.pursuit.shapes import Scalar
 from openjax.vehicle.family import narrowed_bounds
 
@@ -61,12 +60,9 @@ def first_game(environment: Pursuit, stage: FirstFlightsSettings) -> Pursuit:
 
 
 @struct.dataclass
-class FirstCarry:
-    """What the stage is between two updates."""
+class FirstWorlds:
+    """What the lesson carries from update to update."""
 
-    parameters: PolicyParameters
-    optimiser: Any
-    """The state of the actor's."""
     world: Any  # (B, ...)
     ramp: jax.Array
     """() how far the penalties have risen, 0 to 1"""
@@ -79,31 +75,44 @@ class FirstFlights:
     """
 
     settings: FirstFlightsSettings
-    environment: Pursuit
-    """See `first_game`."""
-    policy: Policy
+    flight: SmoothFlight
+    """In the `first_game`."""
     tasks: GeneratorSettings = field(default_factory=GeneratorSettings)
     """How the generator's uniform tasks differ from the paper's; these do, too."""
     axis: str | None = None
     """Of the devices, where there are several."""
 
     @property
-    def stage(self) -> AnalyticGradient:
-        """What flies, and measures."""
-        return AnalyticGradient(AnalyticSettings(), self.environment, self.policy)
+    def updates(self) -> int:
+        """Of the actor."""
+        return self.settings.updates
+
+    @functools.cached_property
+    def optimiser(self) -> optax.GradientTransformation:
+        """Adam with clipped gradients; its step size falls to a twentieth."""
+        schedule = optax.cosine_decay_schedule(
+            self.settings.learning_rate, max(self.settings.updates, 1), SLOWEST_RATE
+        )
+        return clipped_descent(schedule)
+
+    def record(self, parameters: PolicyParameters, key: PRNGKeyArray, late: None = None) -> None:
+        """Nothing: a fresh policy has no flights to learn from."""
+
+    def begin(self, key: PRNGKeyArray) -> FirstWorlds:
+        """Worlds at their starts, no penalties yet."""
+        return FirstWorlds(self.start(key), jnp.zeros(()))
 
     def start(self, key: PRNGKeyArray):
         """Worlds at the starts of uniform tasks and of scattered ones, their vehicles
         nominal.
         """
-        game = self.environment.settings
-
+        environment = self.flight.environment
+        game = environment.settings
         task_keys, reset_keys = (
             own_share(jax.random.split(k, self.settings.worlds), self.axis)
             for k in jax.random.split(key)
         )
         tasks = jax.vmap(functools.partial(draw_anywhere, game, self.tasks))(task_keys)
-        environment = self.environment
         if game.vehicles:
             environment = environment.with_bounds(narrowed_bounds(game.vehicles, 0.0))
         return jax.vmap(environment.reset_to)(reset_keys, tasks)
@@ -113,8 +122,8 @@ class FirstFlights:
         penalties have risen, 0 to 1.
         """
         settings = self.settings
-        is_fast_possible = self.environment.settings.speed_limit == "none"
-        end, encounter = self.stage.fly(actor, parameters, world, settings.steps)
+        is_fast_possible = self.flight.game.speed_limit == "none"
+        end, encounter = self.flight.fly(actor, parameters, world, settings.steps)
         # with whole penalties from the start, pursuers stay away from the evader for
         # good
         penalty = settings.penalty_start + (1.0 - settings.penalty_start) * ramp
@@ -137,13 +146,16 @@ class FirstFlights:
         total, means = weighted_sum(parts)
         return total, (end, means)
 
-    def update(self, carry: FirstCarry, key: PRNGKeyArray) -> tuple[FirstCarry, dict[str, Scalar]]:
-        """The carry after an update, and the parts of the loss."""
-        parameters = carry.parameters
-        world = carry.world
-        ramp = carry.ramp
+    @property
+    def programs(self):
+        """An update is one program; see `Lesson`."""
+        return (self._learn,)
+
+    def _learn(self, turn: Turn, _results: tuple) -> Learnt:
+        world = turn.carry.lesson.world
+        ramp = turn.carry.lesson.ramp
         gradient, (end, parts) = jax.grad(self.loss, has_aux=True)(
-            parameters.actor, parameters, world, ramp
+            turn.actor, turn.parameters, world, ramp
         )
         gradient, parts = mean_over_devices((gradient, parts), self.axis)
         # penalties wait for pursuers that catch: who fears a crash before that never
@@ -152,45 +164,16 @@ class FirstFlights:
         ramp = jnp.minimum(
             ramp + jnp.where(parts["free"] < self.settings.penalty_free, step, 0.0), 1.0
         )
-        change, state = self.optimiser.update(finite_or_zero(gradient), carry.optimiser)
-        parameters = parameters.replace(actor=optax.apply_updates(parameters.actor, change))
-        start_key, choice_key = jax.random.split(key)
+        start_key, choice_key = jax.random.split(turn.key)
         worlds_drawn = jax.random.uniform(choice_key, (self.settings.worlds,)) < self.settings.anew
         over = self._over(end[1]) | own_share(worlds_drawn, self.axis)
-        world = renew(over, end, self.start(start_key))
-        return FirstCarry(parameters, state, world, ramp), parts
+        world = where_rows(over, self.start(start_key), end)
+        return Learnt(gradient, FirstWorlds(world, ramp), parts)
 
     def _over(self, state):
         """(B,) worlds that end: crashed, far outside, or too late for another
         moment.
         """
-        game = self.environment.settings
+        game = self.flight.game
         is_late = state.step > game.episode_length - self.settings.steps
         return is_lost(game, state) | is_late
-
-    @functools.cached_property
-    def optimiser(self) -> optax.GradientTransformation:
-        """Adam with clipped gradients; its step size falls to a twentieth."""
-        schedule = optax.cosine_decay_schedule(
-            self.settings.learning_rate, max(self.settings.updates, 1), SLOWEST_RATE
-        )
-        return clipped_descent(schedule)
-
-    def begin(self, parameters: PolicyParameters, key: PRNGKeyArray) -> FirstCarry:
-        """The carry of `update` before the first one."""
-        return FirstCarry(
-            parameters, self.optimiser.init(parameters.actor), self.start(key), jnp.zeros(())
-        )
-
-
-def make_first_flights(flights: FirstFlights, together: int) -> Callable:
-    """`together` updates as one function (carry, key, updates done) -> carry, mean
-    parts of the loss; to be compiled.
-    """
-
-    def some(carry, key, updates_done):
-        keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(updates_done + jnp.arange(together))
-        carry, parts = jax.lax.scan(flights.update, carry, keys)
-        return carry, jax.tree.map(jnp.mean, parts)
-
-    return some
