@@ -113,8 +113,8 @@ def ruled_reports():
 
     conclude = diagnosis.conclude
 
-    def ruled(evidence):
-        report = conclude(evidence)
+    def ruled(*arguments):
+        report = conclude(*arguments)
         assert broken_rules(report) == []
         return report
 

@@ -67,8 +67,7 @@ def _diagnose(case: Case, without, progress, reference, trims) -> Report:
     if progress:
         progress("trying every effect that the flights can show")
     report = conclude(evidence, trims)
-    seconds = time.perf_counter() - begin
-    return replace(report, identification=evidence.identification, trims=trims, seconds=seconds)
+    return replace(report, seconds=time.perf_counter() - begin)
 
 
 def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
@@ -102,7 +101,12 @@ def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
     no_gap = parts.gap.probability_of_none
     chances = agreeing(chances, words(check, parts) or ("none",), sure, no_gap)
     report = _report(evidence, selection, check, parts, chances)
-    return replace(report, reference=report.reference + _days_in_words(report, of_days, trims))
+    return replace(
+        report,
+        reference=report.reference + _days_in_words(report, of_days, trims),
+        identification=evidence.identification,
+        trims=trims,
+    )
 
 
 def _days_in_words(report: Report, of_days: Collection[str], trims: Change | None) -> str:
