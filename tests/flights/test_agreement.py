@@ -27,7 +27,10 @@ def refusals(columns):
     return kept, [i for i in issues if i.refused]
 
 
-@pytest.mark.parametrize("channel", [c for c in CHANNEL_COLUMNS if c != "battery_voltage"])
+NO_PART = ("battery_voltage", "rotor_speed")  # of the sample flights' channels
+
+
+@pytest.mark.parametrize("channel", [c for c in CHANNEL_COLUMNS if c not in NO_PART])
 @pytest.mark.parametrize("how", ["shuffled", "of another time", "noise"])
 def test_a_channel_that_contradicts_the_others_is_garbage(channel, how, sample_columns):
     columns = sample_columns["flight_b"]
@@ -83,6 +86,25 @@ def test_clocks_apart_filters_and_noise_are_no_contradiction(sample_columns):
         late[name] = columns[name] + 0.003 * rng.standard_normal(len(columns[name]))
     kept, found = refusals(late)
     assert found == [] and kept is not None
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda w: w, ""),
+        (lambda w: w[:, ::-1], "contradictory: w1, w2, w3, w4 against m1"),
+        (lambda w: np.roll(w, 300, 0), "contradictory: w1, w2"),
+        (lambda w: 30 / np.pi * w, "in rpm"),
+        (lambda w: 1e-3 * w, "not the rotors' speeds"),
+        (lambda w: w * [1, -1, 1, -1], "speeds have no sign"),
+    ],
+)
+def test_rotors_turn_as_their_motors_say(change, words, sample_columns):
+    columns = sample_columns["flight_c"]
+    speeds = 2500.0 * np.sqrt(np.stack([columns[f"m{i}"] for i in "1234"], 1))
+    names = CHANNEL_COLUMNS["rotor_speed"]
+    kept, found = refusals(columns | dict(zip(names, change(speeds).T, strict=True)))
+    assert (kept is None) == bool(words) and (not words or words in found[0].issue)
 
 
 def in_wind(columns, force):

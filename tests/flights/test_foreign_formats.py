@@ -3,11 +3,13 @@ without a `columns.toml`: what arrives is what was flown.
 """
 
 import struct
+import sys
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.importers import find_logs, load_mapping, read_log
 from openjax.flights.importers.columns import CHANNEL_COLUMNS
@@ -699,12 +701,215 @@ def test_a_blackbox_without_the_usual_fields(tmp_path, columns):
         read_log(path)
 
 
-@pytest.mark.parametrize("name", ["LOG00001.BFL", "blackbox.bbl", "LOG1.TXT"])
-def test_a_binary_blackbox_names_its_decoder(tmp_path, name):
-    (tmp_path / name).write_bytes(b"H Product:Blackbox flight data recorder\nH Data version:2\n")
+def binary_blackbox(fields, headers=""):
+    """A blackbox as a flight controller writes it, of whole frames alone: {field: whole
+    numbers}, zigzag and seven bits a byte.
+    """
+    zeros = ",".join("0" for _ in fields)
+    lines = [
+        "H Product:Blackbox flight data recorder by Nicholas Sherlock",
+        "H Data version:2",
+        "H I interval:1",
+        "H P interval:1/1",
+        f"H Field I name:{','.join(fields)}",
+        f"H Field I signed:{','.join('1' for _ in fields)}",
+        f"H Field I predictor:{zeros}",
+        f"H Field I encoding:{zeros}",
+        f"H Field P predictor:{zeros}",
+        f"H Field P encoding:{zeros}",
+        *headers.splitlines(),
+    ]
+    data = bytearray("".join(f"{line}\n" for line in lines).encode())
+    for row in zip(*fields.values(), strict=True):
+        data += b"I"
+        for number in map(int, row):
+            rest = number << 1 if number >= 0 else (-number << 1) - 1
+            while rest > 127:
+                data.append(rest & 127 | 128)
+                rest >>= 7
+            data.append(rest)
+    return bytes(data) + b"E\xffEnd of log\0"
+
+
+def indiflight(c):
+    """A sample flight in the counts of Indiflight: pose in north, east, down and forward,
+    right, down, rotor speeds in rad/s.
+    """
+    w, x, y, z = (c[f"q{a}"] for a in "wxyz")
+    half = np.sqrt(0.5)
+    frd = (half * (w + z), half * (x + y), half * (x - y), half * (w - z))
+    numbers = {"loopIteration": np.arange(len(w)), "time": 2_000_000 + 1e6 * c["t"]}
+    numbers |= {f"gyroADC[{i}]": 10 * DEGREES * c[f"w{a}"] for i, a in enumerate("xyz")}
+    numbers |= {f"accSmooth[{i}]": 2048 / G * c[f"a{a}"] for i, a in enumerate("xyz")}
+    numbers |= {f"quat[{i}]": 8127 * q for i, q in enumerate(frd)}
+    numbers |= {f"motor[{i}]": 48 + 1999 * c[m] for i, m in enumerate(("m2", "m1", "m3", "m4"))}
+    numbers |= {f"omega[{i}]": speed_of(c, m) for i, m in enumerate(("m2", "m1", "m3", "m4"))}
+    for name, scale in (("extPos", 1000), ("extVel", 100)):
+        ours = ("y", "x", "z") if name == "extPos" else ("vy", "vx", "vz")
+        signs = zip(ours, (1, 1, -1), strict=True)
+        numbers |= {f"{name}[{i}]": scale * sign * c[n] for i, (n, sign) in enumerate(signs)}
+    return {name: np.rint(values) for name, values in numbers.items()}
+
+
+def speed_of(c, motor):
+    """Of a rotor whose thrust is in proportion to its command, rad/s."""
+    return 2500.0 * np.sqrt(np.clip(c[motor], 0.0, None))
+
+
+@pytest.mark.parametrize("name", ["LOG00001.BFL", "log.bbl", "blackbox"])
+def test_a_binary_blackbox_is_read_with_pose_and_rotor_speeds(tmp_path, columns, name):
+    pytest.importorskip("orangebox")
+    headers = "H acc_1G:2048\nH blackbox_high_resolution:1\nH Firmware revision:Indiflight 5.0.0"
+    (tmp_path / name).write_bytes(binary_blackbox(indiflight(columns), headers))
+    (tmp_path / "vehicle.toml").write_text("")
     assert find_logs(tmp_path) == [tmp_path / name]
-    with pytest.raises(LogError, match=f"blackbox_decode {name}"):
+    read = read_log(tmp_path / name)
+    assert_read(read, columns, ("t", "x", "y", "z", "qw", "qx", "qy", "qz", "wx", "wy", "wz"), 2e-3)
+    assert_read(read, columns, ("vx", "vz", "az", "m1", "m2", "m3", "m4"), 1e-2)
+    assert_read(
+        read, {"w1": speed_of(columns, "m1"), "w3": speed_of(columns, "m3")}, ("w1", "w3"), 1
+    )
+    (flight,) = load_case(tmp_path).flights
+    assert flight.rotor_speed is not None and flight.has_pose
+
+
+def test_electrical_revolutions_are_rotor_speeds(tmp_path, columns):
+    pytest.importorskip("orangebox")
+    fields = indiflight(columns)
+    for i in range(4):  # hundreds in a minute, of a motor of 12 poles
+        fields[f"eRPM[{i}]"] = np.rint(fields.pop(f"omega[{i}]") * 30 / np.pi * 6 / 100)
+    (tmp_path / "log.bbl").write_bytes(binary_blackbox(fields, "H motor_poles:12"))
+    read = read_log(tmp_path / "log.bbl")
+    assert_read(read, {"w1": speed_of(columns, "m1")}, ("w1",), 2.0)
+
+
+@pytest.mark.parametrize(
+    "module, name, data",
+    [
+        ("orangebox", "log.bbl", b"H Product:Blackbox flight data recorder\n"),
+        ("pymavlink.DFReader", "log.bin", b"\xa3\x95\x80"),
+    ],
+)
+def test_a_log_whose_library_is_missing_names_it(tmp_path, monkeypatch, module, name, data):
+    monkeypatch.setitem(sys.modules, module, None)
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(UserError, match=f"pip install '?{module.partition('.')[0]}"):
         read_log(tmp_path / name)
+
+
+@pytest.mark.parametrize("name, library", [("log.bbl", "orangebox"), ("log.bin", "pymavlink")])
+def test_a_binary_log_without_a_flight_says_so(tmp_path, name, library):
+    pytest.importorskip(library)
+    start = b"H Product:Blackbox\n" if name == "log.bbl" else b"\xa3\x95\x80"
+    for rest in (b"", b"H Data version:2\n", bytes(100), b"\xff" * 300):
+        (tmp_path / name).write_bytes(start + rest)
+        with pytest.raises(LogError):
+            read_log(tmp_path / name)
+
+
+# --- ArduPilot
+
+
+def dataflash(messages):
+    """A DataFlash log: [(name, types, fields, rows)], each message declared first."""
+    data = bytearray()
+
+    def declare(kind, length, name, types, fields):
+        nonlocal data
+        texts = (name.encode().ljust(4, b"\0"), types.encode().ljust(16, b"\0"))
+        data += b"\xa3\x95\x80" + struct.pack("<BB", kind, length)
+        data += texts[0] + texts[1] + ",".join(fields).encode().ljust(64, b"\0")
+
+    declare(0x80, 89, "FMT", "BBnNZ", ("Type", "Length", "Name", "Format", "Columns"))
+    records = []
+    for kind, (name, types, fields, rows) in enumerate(messages, start=1):
+        layout = "<" + types.replace("N", "16s")
+        declare(kind, 3 + struct.calcsize(layout), name, types, fields)
+        head = b"\xa3\x95" + bytes([kind])
+        records += [(row[0], head + struct.pack(layout, *row)) for row in rows]
+    return bytes(data) + b"".join(r for _, r in sorted(records, key=lambda r: r[0]))
+
+
+def ardupilot(c, parameters):
+    """A sample flight in ArduPilot's frames and messages, every row of each."""
+    roll, pitch, yaw = (DEGREES * angle for angle in euler(c))
+    time = np.rint(1e6 * (3.0 + c["t"])).astype(int)
+    expo = parameters.get("MOT_THST_EXPO", 0.65)
+    share = {
+        m: (np.sqrt((1 - expo) ** 2 + 4 * expo * c[m]) - (1 - expo)) / (2 * expo)
+        for m in ("m1", "m2", "m3", "m4")
+    }  # of the range, which gives that thrust
+    pulses = [np.rint(1000 + 1000 * share[m]).astype(int) for m in ("m1", "m3", "m4", "m2")]
+    zero = np.zeros(len(time), int)
+    imu = (time, zero, c["wx"], -c["wy"], -c["wz"], c["ax"], -c["ay"], -c["az"])
+    estimate = (time, zero, c["y"], c["x"], -c["z"], c["vy"], c["vx"], -c["vz"])
+    rates = (
+        time,
+        DEGREES * c["cmd_wx"],
+        -DEGREES * c["cmd_wy"],
+        -DEGREES * c["cmd_wz"],
+        c["cmd_thrust"],
+    )
+    messages = [
+        (
+            "PARM",
+            "QNf",
+            ("TimeUS", "Name", "Value"),
+            [(0, name.encode(), value) for name, value in parameters.items()],
+        ),
+        ("IMU", "QBffffff", ("TimeUS", "I", "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ"), imu),
+        ("ATT", "Qfff", ("TimeUS", "Roll", "Pitch", "Yaw"), (time, roll, -pitch, 90.0 - yaw)),
+        ("XKF1", "QBffffff", ("TimeUS", "C", "PN", "PE", "PD", "VN", "VE", "VD"), estimate),
+        ("RCOU", "QHHHH", ("TimeUS", "C1", "C2", "C3", "C4"), (time, *pulses)),
+        ("RATE", "Qffff", ("TimeUS", "RDes", "PDes", "YDes", "AOut"), rates),
+        ("BAT", "QBf", ("TimeUS", "I", "Volt"), (time, zero, np.full(len(time), 15.2))),
+    ]
+    for output, motor in enumerate(("m1", "m3", "m4", "m2")):
+        rpm = np.rint(30 / np.pi * speed_of(c, motor))
+        messages.append(("ESC", "QBf", ("TimeUS", "Instance", "RPM"), (time, zero + output, rpm)))
+    esc = [m for m in messages if m[0] == "ESC"]
+    messages = [m for m in messages if m[0] != "ESC"]
+    rows = [row for *_, of_motor in esc for row in zip(*of_motor, strict=True)]
+    plain = [(n, t, f, v if n == "PARM" else list(zip(*v, strict=True))) for n, t, f, v in messages]
+    return dataflash([*plain, (*esc[0][:3], rows)])
+
+
+@pytest.mark.parametrize("expo", [0.65, 0.3])
+def test_an_ardupilot_log_arrives_in_our_frames_and_order(tmp_path, columns, expo):
+    pytest.importorskip("pymavlink")
+    data = ardupilot(columns, {"MOT_THST_EXPO": expo, "FRAME_CLASS": 1, "FRAME_TYPE": 1})
+    (tmp_path / "00000012.BIN").write_bytes(data)
+    (tmp_path / "vehicle.toml").write_text("")
+    assert find_logs(tmp_path) == [tmp_path / "00000012.BIN"]
+    read = read_log(tmp_path / "00000012.BIN")
+    names = (
+        "t",
+        "x",
+        "y",
+        "z",
+        "vx",
+        "vy",
+        "vz",
+        "wx",
+        "wy",
+        "wz",
+        "ax",
+        "az",
+        "cmd_wy",
+        "cmd_thrust",
+    )
+    assert_read(read, columns, names, 1e-3)
+    assert_read(read, columns, ("qw", "qx", "qy", "qz", "m1", "m2", "m3", "m4"), 2e-3)
+    assert_read(read, {"w2": speed_of(columns, "m2")}, ("w2",), 1.0)
+    (flight,) = load_case(tmp_path).flights
+    assert flight.rotor_speed is not None
+
+
+def test_an_ardupilot_frame_that_is_no_quad_x_is_told(tmp_path, columns):
+    pytest.importorskip("pymavlink")
+    (tmp_path / "log.bin").write_bytes(ardupilot(columns, {"FRAME_CLASS": 2}))
+    with pytest.raises(LogError, match=r"FRAME_CLASS is 2 .* a quad X"):
+        read_log(tmp_path / "log.bin")
 
 
 # --- Crazyswarm2

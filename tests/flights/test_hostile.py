@@ -65,6 +65,7 @@ def test_a_damaged_log_is_read_or_refused(text, tmp_path, edits):
 @pytest.mark.parametrize("value", [0.0, np.nan])
 def test_a_column_that_holds_one_value_is_a_finding_not_an_error(sample_columns, value):
     short = {n: v[:300] for n, v in sample_columns["flight_b"].items()}
+    short |= {f"w{i}": 2500.0 * np.sqrt(short[f"m{i}"]) for i in (1, 2, 3, 4)}
     for column in (c for c in LOG_COLUMNS if c not in ("t", "vehicle")):
         columns = short | {column: np.full(300, value)}
         (flight,), _ = flights_of(LogTable("flight.csv", columns, np.full(300, "0")))

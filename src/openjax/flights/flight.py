@@ -34,6 +34,7 @@ CHANNEL_COLUMNS = {
     "command_thrust": ("cmd_thrust",),
     "command_body_rates": ("cmd_wx", "cmd_wy", "cmd_wz"),
     "motor_command": ("m1", "m2", "m3", "m4"),
+    "rotor_speed": ("w1", "w2", "w3", "w4"),
     "battery_voltage": ("vbat",),
 }
 HOLE = 0.5  # s, longest time without a sample over which a line is drawn
@@ -81,6 +82,7 @@ class Flight:
     command_body_rates: Array | None = None  # (T, 3) rad/s, commanded body rates
     # (T, 4) 0..1, meaning by the vehicle file's `motor_command`
     motor_command: Array | None = None
+    rotor_speed: Array | None = None  # (T, 4) rad/s, measured
     battery_voltage: Array | None = None  # (T,) V, under load
     # True: differentiated from position by the reader, not logged
     velocity_derived: bool = False

@@ -5,10 +5,9 @@ import itertools
 import numpy as np
 
 from openjax.flights.flight import Finding
-from openjax.flights.pairs import AGREE, Signals
+from openjax.flights.pairs import AGREE, TURNING, Signals
 from openjax.flights.signals import RATE, first_order, in_band
 
-TURNING = (0.7, 8.0)  # Hz, where motors turn the vehicle
 MOTORS = "the motors' torques"
 IDENTITY = ((0, 1, 2, 3), 1.0)  # order and spin as logged
 OFFSETS = range(-20, 21, 2)  # rows by which the motors' clock may be off

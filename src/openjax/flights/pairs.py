@@ -22,6 +22,7 @@ from openjax.flights.track import GRAVITY, rotation, to_body
 # Hz: above drift, below the noise of what is compared
 LOW = (0.3, 2.5)
 WIDE = (0.3, 4.0)
+TURNING = (0.7, 8.0)  # where motors turn the vehicle
 WINDOW = 8.0  # s in which a clock offset is constant
 LAG = 0.2  # s, largest clock offset and latency between honest streams
 # share of the correlation to be expected below which two channels contradict each other
@@ -43,6 +44,7 @@ MOVED = {
     "thrust": 0.5,
     "command": 0.4,
     "share": 0.3,
+    "rotor": 1.0,
 }
 
 
@@ -60,6 +62,7 @@ class Signals:
     motor: np.ndarray | None
     thrust: np.ndarray | None
     commands: np.ndarray | None
+    rotors: np.ndarray | None = None
 
     @classmethod
     def of(cls, flight: Flight, grid: Times) -> Signals:
@@ -70,7 +73,7 @@ class Signals:
             "quaternion": flight.attitude_derived,
         }
         channels = ("position", "quaternion", "velocity", "body_rates", "specific_force")
-        channels += ("motor_command", "command_thrust", "command_body_rates")
+        channels += ("motor_command", "command_thrust", "command_body_rates", "rotor_speed")
         return cls(*(None if is_derived.get(c) else on_clock(flight, c, grid) for c in channels))
 
     @cached_property
@@ -250,6 +253,17 @@ def _caused_pairs(s: Signals, along: np.ndarray | None, order: int) -> Iterator[
     """
     if s.motor is None:
         return
+    if s.rotors is not None:
+        yield Pair(
+            names=CHANNEL_COLUMNS["rotor_speed"],
+            signal=100 * s.rotors / np.median(s.rotors),
+            what="m1, m2, m3, m4",
+            reference=100 * s.motor,
+            band=TURNING,
+            least=MOVED["rotor"],
+            unit="%",
+            derivatives=(0, None),
+        )
     collective = s.motor.mean(1, keepdims=True)
     force, order = (along, order) if s.force is None else (s.force[:, 2:], 0)
     if force is not None:

@@ -11,6 +11,8 @@ from openjax.flights.flight import CHANNEL_COLUMNS, Flight, Refused
 # share of rows at one largest value from which that is the sensor's end
 SATURATED = 0.01
 OFTEN = 0.05  # share from which the sensor is of no use
+# rad/s: rotors of such vehicles end below, and a hundredth of it would lift nothing
+FASTEST_ROTOR = 10_000.0
 LEAST_RANGE = {"body_rates": 0.3, "specific_force": 15.0}  # rad/s, m/s^2
 # m: beyond, three coordinates that are one number are a mark, and no place
 NOWHERE = 20.0
@@ -44,11 +46,7 @@ def in_range(flight: Flight, note) -> Flight:
     by their size alone.
     """
     changes = {}
-    motor = flight.motor_command
-    if motor is not None:
-        _share_of_one(motor, "m1, m2, m3, m4")
-    if flight.command_thrust is not None:
-        _share_of_one(flight.command_thrust, "cmd_thrust")
+    _refuse_commands(flight)
     flight = _without_saturated(_without_lost_poses(flight, note), note)
     if flight.quaternion is not None:
         changes["quaternion"] = _of_unit_length(flight.quaternion, note)
@@ -78,6 +76,30 @@ def _refuse_degrees(body_rates: np.ndarray) -> None:
     if fastest > 60.0:
         text = f"wx, wy, wz reach {fastest:.0f}: in deg/s? The log format wants rad/s"
         raise Refused("units", text)
+
+
+def _refuse_commands(flight: Flight) -> None:
+    """Refuse commands that aren't shares of the largest, and rotor speeds that are none."""
+    if flight.motor_command is not None:
+        _share_of_one(flight.motor_command, "m1, m2, m3, m4")
+    if flight.command_thrust is not None:
+        _share_of_one(flight.command_thrust, "cmd_thrust")
+    if flight.rotor_speed is not None:
+        _refuse_revolutions(flight.rotor_speed)
+
+
+def _refuse_revolutions(speed: np.ndarray) -> None:
+    """Refuse rotor speeds (T, 4) that are none in rad/s."""
+    low = float(np.nanmin(speed))
+    high = float(np.nanmedian(np.abs(speed)))
+    if high > FASTEST_ROTOR:
+        text = f"w1, w2, w3, w4 are {high:.0f} in the median: in rpm? The log format wants rad/s"
+        raise Refused("units", text)
+    if high < 0.01 * FASTEST_ROTOR:
+        text = f"w1, w2, w3, w4 are {high:.3g} in the median: not the rotors' speeds in rad/s"
+        raise Refused("units", text)
+    if low < -0.01 * high:
+        raise Refused("corrupt", f"w1, w2, w3, w4 go down to {low:.0f}; speeds have no sign")
 
 
 def _without_saturated(flight: Flight, note) -> Flight:

@@ -15,7 +15,8 @@ from openjax.flights.flight import CHANNEL_COLUMNS, Flight
 LOG_COLUMNS = ("t", "vehicle", *(c for columns in CHANNEL_COLUMNS.values() for c in columns))
 
 # channels of which a part is a mistake, not a choice
-WHOLE = ("quaternion", "motor_command")
+WHOLE = ("quaternion", "motor_command", "rotor_speed")
+OF_ROTORS = ("motor_command", "rotor_speed")
 MOST_VEHICLES = 200  # swarms are of tens
 NAMES_SHOWN = 12  # of columns in one message
 LONGEST_NAME = 40  # characters of a name or a cell in a message
@@ -56,8 +57,8 @@ def flights_of(
     remarks = list(table.remarks)
     all_channels = {c: _channel(table, c, names, remarks) for c, names in CHANNEL_COLUMNS.items()}
     channels = {c: v for c, v in all_channels.items() if v is not None}
-    if "motor_command" in channels:
-        channels["motor_command"] = channels["motor_command"][:, list(motor_permutation)]
+    for channel in set(OF_ROTORS) & set(channels):
+        channels[channel] = channels[channel][:, list(motor_permutation)]
     # of all vehicles at once: a copy of a log is one of all of its flights
     fingerprint = _fingerprint(channels)
     ids = list(dict.fromkeys(table.vehicle.tolist()))
@@ -87,7 +88,7 @@ def _channel(table: LogTable, channel: str, names, remarks: list[str]) -> np.nda
     if len(present) < len(names):
         absent = ", ".join(n for n in names if n not in table.columns)
         if present and channel in WHOLE:
-            hint = "; motors are counted from 1" * (absent == "m4")
+            hint = "; motors are counted from 1" * (absent in ("m4", "w4"))
             raise LogError(
                 f"{', '.join(present)} without {absent}: log {absent}, or none of them{hint}"
             )

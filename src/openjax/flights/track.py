@@ -59,6 +59,7 @@ class Track:
     specific_force: Array | None = None  # (T, 3)
     command: Array | None = None  # (T, 4) thrust 0..1, body rates rad/s
     motor: Array | None = None  # (T, 4) 0..1 thrust fraction
+    rotor_speed: Array | None = None  # (T, 4) rad/s, measured, at the rows' times
     voltage: Array | None = None  # (T,)
     # (K, T, 3) m, positions of the vehicles that flew along
     neighbours: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
@@ -216,6 +217,7 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         **_sensors(take, floor),
         command=_command(take) if part.has_commands else None,
         motor=motor,
+        rotor_speed=take("rotor_speed"),
         voltage=None if voltage is None else smooth(voltage, 0.3, period),
         neighbours=_neighbours(case, flight, grid) - floor,
         pose_age=part.pose_age,
@@ -271,7 +273,8 @@ def _own_track(part: Flight, flight: Flight, case: Case) -> Track:
         voltage = smooth(part.interpolated("battery_voltage", grid), 0.3, period)
     if case.vehicle_file.motor.command == "pwm":
         motor = pwm_thrust(motor, voltage, vehicle)
-    channels = [c for c in SENSORS if c != "position" and getattr(part, c) is not None]
+    wanted_channels = (*(c for c in SENSORS if c != "position"), "rotor_speed")
+    channels = [c for c in wanted_channels if getattr(part, c) is not None]
     return Track(
         name=flight.name,
         flight=flight.log,

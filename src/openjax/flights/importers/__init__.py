@@ -9,6 +9,7 @@ from pathlib import Path
 
 from openjax.errors import UserError
 from openjax.flights.importers import (
+    ardupilot,
     betaflight,
     crazyflie,
     log_format,
@@ -50,6 +51,7 @@ for _importer in (
     topic_times.IMPORTER,
     betaflight.BINARY_IMPORTER,
     px4.IMPORTER,
+    ardupilot.IMPORTER,
     micro_sd.IMPORTER,
     ros2.IMPORTER,
 ):

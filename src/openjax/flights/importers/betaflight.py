@@ -1,5 +1,6 @@
-"""Betaflight's blackbox: CSV files as `blackbox_decode` and the Blackbox Explorer write
-them.
+"""Betaflight's blackbox, binary through the `orangebox` library, and CSV files as
+`blackbox_decode` and the Blackbox Explorer write them. Indiflight, a fork, adds pose and
+rotor speeds to it (tudelft/indiflight, blackbox.c).
 
 `blackbox_decode` (blackbox-tools, blackbox_decode.c) puts a field's unit in brackets
 behind its name unless the field is raw. Raw are degrees per second for `gyroADC` and
@@ -13,12 +14,16 @@ Axes are forward, left, up, as here: the mixer's signs say so, in which a positi
 raises the rear motors. Motors are rear right, front right, rear left, front left.
 """
 
+import contextlib
+import io
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from openjax.flights.csv_text import find_header, head_of
+from openjax.errors import UserError
+from openjax.flights.csv_text import LARGEST, find_header, head_of
 from openjax.flights.importers.columns import UNITS, ColumnMapping, Source, Stream, merge_streams
 from openjax.flights.importers.csv_files import delimiter_of, is_csv, raw_columns
 from openjax.flights.importers.importer import Importer
@@ -34,6 +39,8 @@ FIRST = "loopIteration"  # the name of the first column
 HEADERS_FILE = ".headers.csv"
 # how else files are called that a decoder writes
 BESIDE = (HEADERS_FILE, ".gps.csv", ".event.csv")
+QUATERNION_UNIT = 8127.0  # counts of Indiflight for 1: 127 * 64 - 1
+_POSE = (*CHANNEL_COLUMNS["position"], *CHANNEL_COLUMNS["velocity"], *CHANNEL_COLUMNS["quaternion"])
 FINE = 10.0  # by which blackbox_high_resolution multiplies rates
 _UNIT_NAMES = {"m/s2": "m/s^2"}
 _FIELD = re.compile(r"(.*?)(?: \((.*)\))?")
@@ -77,11 +84,39 @@ def is_blackbox_binary(path: Path) -> bool:
 
 
 def read_blackbox_binary(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
-    """Raises LogError, which names the decoder."""
-    raise LogError(
-        f"a Betaflight blackbox in its binary form: decode it first, `blackbox_decode {path.name}` "
-        "(github.com/betaflight/blackbox-tools), and put the .csv here"
-    )
+    """A blackbox as the flight controller wrote it. Raises LogError where it can't be
+    read, UserError without the library.
+    """
+    try:
+        from orangebox import Parser
+    except ImportError as error:
+        raise UserError(
+            f"{path}: reading a blackbox needs the orangebox library: pip install 'orangebox<0.5' "
+            "(or decode it with blackbox_decode, and put the .csv here)"
+        ) from error
+    if path.stat().st_size > LARGEST:
+        raise LogError(f"holds more than {LARGEST >> 20} MB: cut it into flights")
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):  # it tells of damages there
+            parser = Parser.load(str(path))
+            names = parser.field_names
+            rows = [frame.data for frame in parser.frames() if frame.type.value in ("I", "P")]
+            logs = parser.reader.log_count
+    except Exception as error:  # damaged logs raise many kinds; all mean the same here
+        words = (str(error).splitlines() or [type(error).__name__])[0]
+        raise LogError(f"blackbox can't be read: {words}") from error
+    if not rows:
+        raise LogError("a blackbox without a frame: was it armed?")
+    values = np.array([[np.nan if v == "" else v for v in row] for row in rows], float)
+    raw = dict(zip(names, values.T, strict=True))
+    headers = {name.replace(" ", ""): str(value) for name, value in parser.headers.items()}
+    # as the CSV's headers have it: 'Betaflight 4.4.0 (...)'
+    revision = re.search(r"\d+\.\d+", headers.get("Firmwarerevision", ""))
+    headers["firmwareVersion"] = revision[0] if revision else "4"
+    remarks = [f"of {logs} logs in the file the first is read"] * (logs > 1)
+    fields = _fields(names)
+    remarks += _without_filter(fields)
+    return _table(_Blackbox(path.name, raw, fields, headers), mapping, remarks)
 
 
 def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
@@ -95,18 +130,46 @@ def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTa
     if log_file.is_file():
         # what a decoder put beside the table goes before what stands above it
         headers |= _headers(head_of(log_file))
-    fields = {_FIELD.fullmatch(name)[1]: name for name in names}
-    # a hexacopter's first four motors would be read as a quad's
-    if "motor[4]" in fields:
-        raise LogError("more than four motors were logged; four are needed")
+    fields = _fields(names)
     remarks = _without_filter(fields)
-    usual = _usual(fields, headers)
     time = fields.get("time", "time")
     mapping_columns = {} if mapping is None else mapping.columns
-    columns_read = (time, *(source.name for source in (*usual.values(), *mapping_columns.values())))
+    sources = (*_usual(fields, headers).values(), *mapping_columns.values())
+    columns_read = (time, *(source.name for source in sources))
     raw, more_remarks = raw_columns(path, columns_read, time, delimiter, above)
-    remarks += more_remarks
-    columns = usual | _force(raw, fields, headers, remarks) | _motors(raw, fields, remarks)
+    return _table(_Blackbox(path.name, raw, fields, headers), mapping, [*remarks, *more_remarks])
+
+
+def _fields(names: list[str]) -> dict[str, str]:
+    """{field: the column's name} of a log's columns. Raises LogError for more motors than
+    four: a hexacopter's first four would be read as a quad's.
+    """
+    fields = {_FIELD.fullmatch(name)[1]: name for name in names}
+    if "motor[4]" in fields:
+        raise LogError("more than four motors were logged; four are needed")
+    return fields
+
+
+@dataclass(frozen=True, eq=False)
+class _Blackbox:
+    """A blackbox as it was read: raw values by the columns' names, the column of each
+    field, and the log's headers.
+    """
+
+    name: str
+    raw: dict[str, np.ndarray]
+    fields: dict[str, str]
+    headers: dict[str, str]
+
+
+def _table(log: _Blackbox, mapping: ColumnMapping | None, remarks: list[str]) -> LogTable:
+    """The log's table of its fields' raw values."""
+    fields = log.fields
+    time = fields.get("time", "time")
+    mapping_columns = {} if mapping is None else mapping.columns
+    raw = log.raw | _east_north_up(log.raw, fields)
+    columns = _usual(fields, log.headers) | {c: Source(c) for c in _POSE if c in raw}
+    columns |= _force(raw, fields, log.headers, remarks) | _motors(raw, fields, remarks)
     if mapping is not None:
         columns = mapping.over(columns)
     seconds = raw[time] * UNITS.get(_FIELD.fullmatch(time)[2] or "us", UNITS["us"])
@@ -115,7 +178,7 @@ def read_blackbox_csv(path: Path, mapping: ColumnMapping | None = None) -> LogTa
     for motor in set(CHANNEL_COLUMNS["motor_command"]) & set(table) - set(mapping_columns):
         # a motor at rest is below DShot's least
         table[motor] = np.maximum(table[motor], 0.0)
-    return LogTable(path.name, table, np.full(len(table["t"]), "0"), tuple(remarks))
+    return LogTable(log.name, table, np.full(len(table["t"]), "0"), tuple(remarks))
 
 
 def _without_filter(fields: dict[str, str]) -> list[str]:
@@ -146,6 +209,12 @@ def _usual(fields: dict[str, str], headers: dict[str, str]) -> dict[str, Source]
     channels |= {f"a{a}": (f"accSmooth[{i}]", 1.0) for i, a in enumerate("xyz")}
     channels |= {column: (f"motor[{i}]", 1.0) for column, i in MOTOR_OF.items()}
     channels |= {"cmd_thrust": ("setpoint[3]", 1e-3)}
+    # Indiflight's own, rad/s, or hundreds of electrical revolutions in a minute
+    pole_pairs = (_number(headers, "motor_poles") or 14.0) / 2.0
+    for rotor, i in MOTOR_OF.items():
+        speed = ("omegaUnfiltered", 1.0) if "omegaUnfiltered[0]" in fields else ("omega", 1.0)
+        speed = speed if f"{speed[0]}[0]" in fields else ("eRPM", 100.0 * UNITS["rpm"] / pole_pairs)
+        channels[rotor.replace("m", "w")] = (f"{speed[0]}[{i}]", speed[1])
     # up to Betaflight 3 the battery was logged in tenths of a volt
     channels |= {"vbat": ("vbatLatest", 0.1 if old else 0.01)}
     return {
@@ -153,6 +222,28 @@ def _usual(fields: dict[str, str], headers: dict[str, str]) -> dict[str, Source]
         for column, (field, usual) in channels.items()
         if field in fields
     }
+
+
+def _east_north_up(raw, fields: dict[str, str]) -> dict[str, np.ndarray]:
+    """Pose and velocity as Indiflight logs them, in north, east, down and forward, right,
+    down, in the log format's frames: of motion capture where that was logged.
+    """
+    columns = {}
+    for axis, (index, sign) in {"x": (1, 1.0), "y": (0, 1.0), "z": (2, -1.0)}.items():
+        for column, names, unit in (
+            (axis, ("extPos", "pos"), 1e-3),
+            (f"v{axis}", ("extVel", "vel"), 1e-2),
+        ):
+            name = next((fields[f"{n}[{index}]"] for n in names if f"{n}[{index}]" in fields), "")
+            if name in raw and np.ptp(raw[name][np.isfinite(raw[name])]) > 0.0:
+                columns[column] = sign * unit * raw[name]
+    attitude = [raw.get(fields.get(f"quat[{i}]")) for i in range(4)]
+    if all(values is not None for values in attitude):
+        w, x, y, z = (values / QUATERNION_UNIT for values in attitude)
+        half = np.sqrt(0.5)
+        columns |= {"qw": half * (w + z), "qx": half * (x + y)}
+        columns |= {"qy": half * (x - y), "qz": half * (w - z)}
+    return columns
 
 
 def _number(headers: dict[str, str], name: str) -> float:

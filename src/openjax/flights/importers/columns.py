@@ -44,6 +44,7 @@ UNITS = {
     "1": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9,
     "m": 1.0, "cm": 1e-2, "mm": 1e-3, "m/s": 1.0, "mm/s": 1e-3,
     "rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180, "mrad/s": 1e-3,
+    "rpm": math.pi / 30,
     "m/s^2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "V": 1.0, "mV": 1e-3,
     "percent": 1e-2, "8bit": 1 / 255, "16bit": 1 / 65535,
 }  # fmt: skip
@@ -59,7 +60,7 @@ _MOTION = {
     *CHANNEL_COLUMNS["body_rates"],
     *CHANNEL_COLUMNS["specific_force"],
 }
-_CONTINUOUS = _MOTION | set(CHANNEL_COLUMNS["velocity"]) | set(EULER)
+_CONTINUOUS = _MOTION.union(CHANNEL_COLUMNS["velocity"], CHANNEL_COLUMNS["rotor_speed"], EULER)
 OVERTAKEN = 1.0  # s by which a message may come before an older one
 # s: stamps since 1970 are known to .24 us, so that what is sent with a row may seem
 # later
