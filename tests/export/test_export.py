@@ -2,6 +2,8 @@
 what it can't say.
 """
 
+import ctypes
+import dataclasses
 import json
 import os
 import shutil
@@ -14,10 +16,11 @@ import pytest
 from openjax.commands.export import EACH, Arguments, export, observations
 from openjax.errors import UserError
 from openjax.export.c_compiled import compile_c
-from openjax.export.c_program import c_program
+from openjax.export.c_program import Draws, c_program
 from openjax.learning import TrainSettings
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Observation, Pursuit, PursuitSettings
+from openjax.store.mixed_policies import mixed_policy
 from openjax.store.policies import abstract_parameters, load_policy
 from openjax.store.policy_files import save_policy_file
 
@@ -97,15 +100,74 @@ def test_the_c_program_is_one_vehicles_policy_for_any_observation(policy_file, f
     inputs = {
         name: jax.ShapeDtypeStruct(values.shape[1:], values.dtype) for name, values in own.items()
     }
-    program = c_program(
-        lambda **fields: policy(Observation(**fields)), inputs, "action", "small", "A policy"
-    )
+    program = c_program(lambda **fields: policy(Observation(**fields)), inputs, "small", "A policy")
     assert np.ptp(expected, axis=0).min() > 0.01  # a thousand times what may differ
     np.testing.assert_allclose(compile_c(program, "small")(own), expected, atol=1e-5)
     assert "privileged" not in program.inputs
     assert program.workspace < 2000 and program.numbers < sum(
         leaf.size for leaf in jax.tree.leaves(policy.parameters)
     )
+
+
+@pytest.fixture(scope="module")
+def mixed_file(policy_file):
+    """A team that draws one of two policies every 0.4 s."""
+    member = load_policy(str(policy_file))
+    scale = jax.tree.map(lambda leaf: 0.5 * leaf, member.parameters)
+    both = mixed_policy([member, dataclasses.replace(member, parameters=scale)], 0.4)
+    path = policy_file.with_name("mixed.npz")
+    save_policy_file(path, both.parameters, both.settings, storage="float32")
+    return path
+
+
+@pytest.mark.parametrize("kind", ["onnx", pytest.param("c", marks=NEEDS_CC)])
+def test_who_draws_a_strategy_is_said(mixed_file, flown, tmp_path, monkeypatch, kind):
+    if kind == "onnx":
+        pytest.importorskip("onnxruntime", reason='the extra "export" is not installed')
+    seen = flown | {"strategy": np.arange(64, dtype=np.int32) % 2}
+    monkeypatch.setattr("openjax.commands.export.observations", lambda *_: seen)
+    export(Arguments(str(mixed_file), kind, out=tmp_path, observations=64))
+    said = json.loads((tmp_path / f"{kind}.json").read_text())
+    assert "strategy" in said["inputs"] and "0 to 1" in said["strategy"]
+    assert (said["strategies"], said["strategy_seconds"], said["strategy_steps"]) == (2, 0.4, 40)
+    if kind == "c":
+        header = (tmp_path / "policy.h").read_text()
+        assert "equal odds" in header and "POLICY_STRATEGY_STEPS 40 " in header
+
+
+@NEEDS_CC
+def test_the_c_program_draws_with_equal_odds_and_the_same_again():
+    kinds = {
+        "x": jax.ShapeDtypeStruct((2,), jnp.float32),
+        "strategy": jax.ShapeDtypeStruct((), jnp.int32),
+    }
+    program = c_program(
+        lambda x, strategy: jnp.where(strategy == 0, x, -x),
+        kinds,
+        "draw",
+        "A test",
+        Draws(3, 40, 0.4),
+    )
+    compiled = compile_c(program, "draw")
+    pointer = ctypes.byref(compiled.observation)
+
+    def draws(seed, steps):
+        """What is drawn in each of some steps."""
+        out = []
+        for step in steps:
+            compiled.library.draw_draw_strategy(
+                pointer, ctypes.c_uint32(seed), ctypes.c_uint32(step)
+            )
+            out.append(int(compiled.observation.strategy[0]))
+        return out
+
+    games = np.array([draws(seed, range(0, 40 * 30, 40)) for seed in range(100)])
+    # 3,000 draws: five standard deviations of a third of them are 130
+    assert (np.abs(np.bincount(games.ravel(), minlength=3) - 1000) < 130).all()
+    # nor does one draw tell the next
+    following = np.bincount((3 * games[:, :-1] + games[:, 1:]).ravel(), minlength=9)
+    assert (np.abs(following - 2900 / 9) < 5 * np.sqrt(2900 / 9)).all()
+    assert draws(7, range(0, 1200, 40)) == draws(7, range(39, 1239, 40)) == games[7].tolist()
 
 
 def everything(x, flag):
@@ -140,7 +202,7 @@ def test_operations_become_their_counterparts_in_onnx():
 
 @NEEDS_CC
 def test_operations_become_their_counterparts_in_c():
-    found = compile_c(c_program(everything, KINDS, "y", "everything", "A test"), "everything")
+    found = compile_c(c_program(everything, KINDS, "everything", "A test"), "everything")
     np.testing.assert_allclose(
         found({"x": X[None], "flag": FLAG[None]})[0], everything(X, FLAG), rtol=2e-5, atol=2e-5
     )
@@ -154,4 +216,4 @@ def test_what_has_no_counterpart_is_named():
     with pytest.raises(UserError, match="sort"):
         onnx_model(lambda x: jnp.sort(x), kinds, "y")
     with pytest.raises(UserError, match="sort"):
-        c_program(lambda x: jnp.sort(x), kinds, "y", "sorted", "A test")
+        c_program(lambda x: jnp.sort(x), kinds, "sorted", "A test")

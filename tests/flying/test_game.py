@@ -39,12 +39,29 @@ def test_the_packed_tick_plays_as_the_games_own_functions():
         play = game.step(seen, evader)
         place = np.zeros(3, np.float32) if evader is None else evader.astype(np.float32)
         state, action, *rest = tick(state, action, pose_array(seen), place, evader is not None)
-        for mine, expected in zip(play, (action, *rest), strict=True):
+        for mine, expected in zip(play[:7], (action, *rest), strict=True):
             np.testing.assert_allclose(
                 np.asarray(mine, float), np.asarray(expected, float), atol=1e-5
             )
         caught |= play.captured
     assert caught
+
+
+def test_what_a_team_draws_is_told():
+    """As the game's state has it; a policy that draws nothing tells nothing."""
+    policy = load_policy("evaders")
+    settings = policy.settings.environment
+    assert settings.strategies > 1
+    scenario = find_scenario("wall", settings)
+    slots = max(settings.max_pillars, len(scenario.pillars))
+    task = scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario)
+    game = Game(policy, task)
+    poses = [Pose(0.0, (0.3 * i, 0.0, 0.5), (0.0,) * 3, (1.0, 0.0, 0.0, 0.0)) for i in range(3)]
+    drawn = [game.start(poses).strategies for _ in range(4)]
+    assert len(drawn[0]) == -(-settings.episode_length // settings.strategy_steps)
+    assert len(set(drawn)) > 1 and {n for draws in drawn for n in draws} == set(
+        range(settings.strategies)
+    )
 
 
 def test_a_compiler_without_the_option_compiles_as_it_does():

@@ -127,7 +127,8 @@ def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None
     def act(**fields):
         return policy(Observation(**fields))
 
-    files, actions, extra = write(act, inputs, samples, policy.source)
+    draws = _draws(policy.settings.environment)
+    files, actions, extra = write(act, inputs, samples, (policy.source, draws))
     report = {
         "policy": policy.source,
         "format": arguments.format,
@@ -136,6 +137,7 @@ def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None
         "observations": len(reference_actions),
         "largest_difference": _difference(actions, reference_actions, policy.source),
         "output": {"action": [int(n) for n in reference_actions.shape[1:]]},
+        **({} if draws is None else _describe_draws(draws)),
         **extra,
     }
     files[f"{arguments.format}.json"] = (json.dumps(report, indent=1) + "\n").encode()
@@ -143,6 +145,25 @@ def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None
         with replacing(arguments.out / name) as partial:
             partial.write_bytes(data)
     return report
+
+
+def _draws(settings):
+    """How the policy's team draws its strategies; None where it has one."""
+    from openjax.export.c_program import Draws
+
+    if settings.strategies == 1:
+        return None
+    steps = min(settings.strategy_steps, settings.episode_length)
+    return Draws(settings.strategies, steps, round(steps * settings.time_step, 6))
+
+
+def _describe_draws(draws) -> dict:
+    return {
+        "strategies": draws.strategies,
+        "strategy_seconds": draws.seconds,
+        "strategy_steps": draws.steps,
+        "strategy": draws.in_words(),
+    }
 
 
 def _samples(policy, arguments):
@@ -181,7 +202,7 @@ def _describe(inputs) -> dict:
     }
 
 
-def _onnx(act, inputs, samples, source):
+def _onnx(act, inputs, samples, about):
     """The files, their actions on the sampled observations, and what to say about
     them.
     """
@@ -210,7 +231,7 @@ def _onnx(act, inputs, samples, source):
     return {NAMES["onnx"]: data}, np.stack(actions), extra
 
 
-def _jax(act, inputs, samples, source):
+def _jax(act, inputs, samples, about):
     """See `_onnx`."""
     import jax
     import numpy as np
@@ -227,15 +248,16 @@ def _jax(act, inputs, samples, source):
     return {NAMES["jax"]: data}, np.stack(actions), extra
 
 
-def _c(act, inputs, samples, source):
+def _c(act, inputs, samples, about):
     """See `_onnx`; nothing is compared where there is no C compiler."""
     from openjax.export.c_compiled import compile_c
     from openjax.export.c_program import c_program
 
     name = Path(NAMES["c"]).stem
     # for every C compiler, in a comment
+    source, draws = about
     readable = Path(source).name.encode("ascii", "backslashreplace").decode()
-    program = c_program(act, inputs, "action", name, f"The policy {readable}")
+    program = c_program(act, inputs, name, f"The policy {readable}", draws)
     extra = {
         "inputs": _describe(program.inputs),
         "numbers": program.numbers,

@@ -211,7 +211,16 @@ def prepare(arguments: Arguments) -> Prepared:
     if line:
         remarks = (line, *remarks)
     about = {"policy": policy.source, "scenario": scenario.name, "uris": uris}
+    about |= _draws(settings)
     return Prepared(game, state, session, vehicle, about, remarks, seconds)
+
+
+def _draws(settings) -> dict:
+    """What flight.json says of a team that draws its strategies, beside what it drew."""
+    if settings.strategies == 1:
+        return {}
+    seconds = round(settings.strategy_steps * settings.time_step, 6)
+    return {"strategies": settings.strategies, "strategy_seconds": seconds}
 
 
 def _prepare_plan(arguments: Arguments) -> Prepared:

@@ -20,7 +20,12 @@ FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared
 
 
 class Compiled:
-    """A compiled program. Raises UserError if the compiler refuses it."""
+    """A compiled program. Raises UserError if the compiler refuses it.
+
+    Attributes:
+      library: with all that its header declares.
+      observation: the structure that its functions take.
+    """
 
     def __init__(self, program: CProgram, name: str, compiler: str):
         with tempfile.TemporaryDirectory() as scratch, unfinished(Path(scratch)):
@@ -34,23 +39,24 @@ class Compiled:
                 errors = [line for line in ran.stderr.splitlines() if "error" in line]
                 complaint = errors[0] if errors else "no word"
                 raise UserError(f"{compiler} refuses the exported program: {complaint}")
-            self._function = getattr(ctypes.CDLL(str(library)), name)
+            self.library = ctypes.CDLL(str(library))
+        self._function = getattr(self.library, name)
         self._function.restype = None
         self._inputs = tuple(program.inputs)
         fields = []
         for field, kind in program.inputs.items():
             number = ctypes.c_ubyte if kind.dtype == bool else ctypes.c_float
             fields.append((field, number * math.prod(kind.shape)))
-        observation = type("Observation", (ctypes.Structure,), {"_fields_": fields})()
-        self._observation = {
-            name: np.ctypeslib.as_array(getattr(observation, name)) for name in self._inputs
+        self.observation = type("Observation", (ctypes.Structure,), {"_fields_": fields})()
+        self._arrays = {
+            name: np.ctypeslib.as_array(getattr(self.observation, name)) for name in self._inputs
         }
         # nobody clears it on a vehicle either: what is read before it was written shows
         # as NaN
         self._workspace = np.full(program.workspace, np.nan, np.float32)
         self._output = np.zeros(program.shape, np.float32)
         self._pointers = [
-            ctypes.byref(observation),
+            ctypes.byref(self.observation),
             ctypes.c_void_p(self._workspace.ctypes.data),
             ctypes.c_void_p(self._output.ctypes.data),
         ]
@@ -60,7 +66,7 @@ class Compiled:
         outputs = []
         for i in range(len(samples[self._inputs[0]])):
             for name in self._inputs:
-                self._observation[name][:] = samples[name][i].reshape(-1)
+                self._arrays[name][:] = samples[name][i].reshape(-1)
             self._function(*self._pointers)
             outputs.append(self._output.copy())
         return np.stack(outputs)

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jinja2
@@ -24,6 +25,26 @@ _TEMPLATES = jinja2.Environment(
     undefined=jinja2.StrictUndefined,
 )
 _TEMPLATES.filters |= {"dims": dims, "number_rows": number_rows, "product": math.prod}
+
+
+class Draws(NamedTuple):
+    """How a team draws which of its strategies it flies."""
+
+    strategies: int
+    """As many; each is drawn with equal odds."""
+    steps: int
+    """Control steps between two draws."""
+    seconds: float
+    """s between two draws."""
+
+    def in_words(self) -> str:
+        """What whoever runs an exported policy has to do."""
+        return (
+            f"strategy is drawn by the program that calls the policy: a whole number from 0 to "
+            f"{self.strategies - 1}, with equal odds, when a game begins and every "
+            f"{self.steps} control steps ({self.seconds:g} s); all pursuers of a team take the "
+            "same one. A team that always flies one strategy is beaten far more often"
+        )
 
 
 @dataclass
@@ -70,24 +91,24 @@ def _place(buffers: list[Buffer]) -> int:
 def c_program(
     function: Callable,
     inputs: dict[str, jax.ShapeDtypeStruct],
-    output: str,
     prefix: str,
     about: str,
+    draws: Draws | None = None,
 ) -> CProgram:
-    """A C program of `function(**inputs)`, which returns one array; inputs that it
-    doesn't read are left out.
+    """A C program of `function(**inputs)`, which returns one array, `action`; inputs
+    that it doesn't read are left out.
 
     Args:
       function: to be traced.
       inputs: names and kinds of its arguments; arrays of floats or flags.
-      output: name of what it returns.
       prefix: of all names that the header declares, and of the header's file.
       about: a line for the top of both files.
+      draws: where an input `strategy` is drawn, how; a function that does is added.
 
     Raises:
       UserError: the function uses an operation that isn't covered.
     """
-    writer, workspace, shape = _write(function, inputs, output)
+    writer, workspace, shape = _write(function, inputs)
     text = "\n".join(writer.statements)
     buffers_read = {
         name: kind
@@ -98,7 +119,7 @@ def c_program(
         "about": about,
         "prefix": prefix,
         "inputs": buffers_read,
-        "output": output,
+        "draws": draws if "strategy" in buffers_read else None,
         "shape": shape,
         "workspace": workspace,
         "writer": writer,
@@ -116,7 +137,7 @@ def c_program(
     )
 
 
-def _write(function, inputs, output):
+def _write(function, inputs):
     """The statements of a function, the floats of workspace that they need, and the
     shape of its result.
     """
@@ -125,5 +146,5 @@ def _write(function, inputs, output):
     arrays = [dense_array(f"in->{name}", kind.shape) for name, kind in inputs.items()]
     (result,) = writer.run(program.jaxpr, program.consts, arrays)
     shape = tuple(program.out_avals[0].shape)
-    writer.write(dense_array(output, shape), "{}", [writer.array(result)])
+    writer.write(dense_array("action", shape), "{}", [writer.array(result)])
     return writer, _place(writer.buffers), shape

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.interpolate import CubicSpline
 from scipy.ndimage import convolve1d
 from scipy.spatial.transform import Rotation
 
@@ -29,6 +30,7 @@ MIN_DURATION = 2.0  # s, shorter stretches say next to nothing and are left out
 CHANNELS = (*SENSORS, "motor_command", "command_thrust", "command_body_rates")
 MAX_GAP = 0.05  # s, a longer step between rows splits the flight
 MISSED_SAMPLES = 3.0  # and a channel that misses more than so many has a hole
+SPARSE = 0.8  # periods between samples of a channel that comes no faster than the clock
 RHYTHM = 50  # new commands from which their rhythm is looked for
 RHYTHMIC = 0.5  # concentration of their phases (0 to 1) from which they have one
 EARLY = 25.0  # per cent of them that may come before the rows that are made for them
@@ -194,6 +196,12 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         # next row, the mean that follows it.
         at, values = part.sampled(channel)
         flat = values.reshape(len(values), -1)
+        if channel == "body_rates" and np.median(np.diff(at)) > SPARSE * period:
+            # lines between samples as far apart as the clock's would take a tenth off a
+            # quick turn, and a rate loop would seem to answer more than it was told
+            curve = CubicSpline(at, flat)
+            at = np.arange(at[0], at[-1], part.row_period)
+            flat = curve(at)
         means = _means(at, flat, grid if ahead else grid - 0.5 * period, period, ahead)
         return means.reshape((len(grid), *values.shape[1:]))
 

@@ -24,7 +24,7 @@ from openjax.flights.csv_table import csv_rows
 from openjax.flights.reading import CHANNEL_COLUMNS, LOG_COLUMNS, LogTable
 from openjax.flying.set_point import RATES
 
-BYTES_PER_SECOND = 64_000
+BYTES_PER_SECOND = 90_000
 """What a second of one vehicle takes at most, unpacked, with five log blocks of motors."""
 LONGEST = 900.0
 """No battery of such a vehicle lasts longer (s)."""
@@ -36,7 +36,11 @@ _POSE = (
     *CHANNEL_COLUMNS["body_rates"],
 )
 """Of a `Pose`'s 13 numbers, in their order."""
-_BODY = CHANNEL_COLUMNS["motor_command"] + CHANNEL_COLUMNS["specific_force"]
+_BODY = (
+    *CHANNEL_COLUMNS["motor_command"],
+    *CHANNEL_COLUMNS["specific_force"],
+    *CHANNEL_COLUMNS["body_rates"],
+)
 _COMMAND = CHANNEL_COLUMNS["command_thrust"] + CHANNEL_COLUMNS["command_body_rates"]
 _READINGS = (*_POSE, *_BODY, *_COMMAND, "vbat")
 COLUMNS = tuple(n for n in LOG_COLUMNS if n in ("t", "vehicle", *_READINGS))
@@ -128,7 +132,7 @@ class Samples:
     quaternion, body rates.
     """
     bodies: np.ndarray
-    """(K, 8): when measured, m1..m4 0..1, the specific force (m/s^2)."""
+    """(K, 11): when measured, m1..m4 0..1, the specific force (m/s^2), body rates."""
     seen: np.ndarray
     """(K, 14) by motion capture, where there is one: when measured, position, velocity,
     quaternion, body rates.

@@ -25,6 +25,8 @@ class GameNotes:
     end: str = ""
     over_speed: int = 0
     """Steps in which a pursuer was faster than the game allows."""
+    strategies: tuple[int, ...] = ()
+    """What the team drew for it, see `openjax.flying.game.Play`."""
 
     def count(self, play, is_too_fast: bool) -> None:
         """Add a step, see `openjax.flying.game.Play`."""
@@ -85,9 +87,9 @@ class FlightRecord:
         """Add rows that another record told."""
         self._rows.frombytes(rows)
 
-    def begin_game(self) -> int:
-        """The number of a game that begins now."""
-        self.games.append(GameNotes())
+    def begin_game(self, strategies: tuple[int, ...] = ()) -> int:
+        """The number of a game that begins now, in which a team flies what it drew."""
+        self.games.append(GameNotes(strategies=strategies))
         return self._hand_on()
 
     def count(self, play, is_too_fast: bool) -> None:

@@ -29,6 +29,10 @@ class Play(NamedTuple):
     over: bool
     breaches: np.ndarray  # (N,)
     crashed: np.ndarray  # (N,)
+    strategies: tuple[int, ...] = ()
+    """At the start of an episode: which of its strategies the team flies, one after
+    another; empty where it has one.
+    """
 
 
 def game_functions(policy):
@@ -116,7 +120,9 @@ class Game:
         # again
         def begin(poses, seed):
             state, action = first(task, poses, seed)
-            return ravel_pytree((state, action))[0], action
+            none = np.zeros(0, np.int32)
+            draws = none if state.strategies is None else state.strategies
+            return ravel_pytree((state, action))[0], action, draws
 
         def move(flat, poses, evader, evader_measured):
             state, action = unflatten(flat)
@@ -135,7 +141,7 @@ class Game:
     def start(self, poses: list[Pose]) -> Play:
         """Begin an episode with the pursuers at `poses`."""
         seed = self._draws.integers(2**32, dtype=np.uint32)
-        self._flat, action = self._first(pose_array(poses), seed)
+        self._flat, action, draws = self._first(pose_array(poses), seed)
         n = self.settings.num_pursuers
         return Play(
             action=np.asarray(action),
@@ -145,6 +151,7 @@ class Game:
             over=False,
             breaches=np.zeros(n),
             crashed=np.zeros(n, bool),
+            strategies=tuple(np.asarray(draws).tolist()),
         )
 
     def step(self, poses: list[Pose], evader: np.ndarray | None = None) -> Play:

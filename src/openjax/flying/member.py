@@ -22,6 +22,8 @@ POSE_BLOCK = (
 BODY_BLOCK = (
     *((f"motor.m{i}", "uint16_t") for i in range(1, 5)),
     *((f"acc.{v}", "FP16") for v in "xyz"),
+    # with the motors that answer it: a gyroscope logged at 100 Hz hides what they do
+    *((f"gyro.{v}", "FP16") for v in "xyz"),
 )
 
 
@@ -80,15 +82,16 @@ class Member:
         self.listener(True)
 
     def body_arrived(self, stamp: int, data: dict, _block=None) -> None:
-        """A block of motors and accelerometer."""
+        """A block of motors, accelerometer and gyroscope."""
         arrival = perf_counter()
         self.last_contact = arrival
         self.phases[_block] = stamp % PERIOD_MS
         time = self._onboard.host(stamp, arrival)
-        force = tuple(9.81 * data[name] for name, _ in BODY_BLOCK[4:])
+        # the accelerometer counts in g, the gyroscope in degrees
+        force = tuple(9.81 * data[name] for name, _ in BODY_BLOCK[4:7])
+        rates = tuple(math.radians(data[name]) for name, _ in BODY_BLOCK[7:])
         if time > self.felt[0]:  # packets may overtake each other
             self.felt = time, force
-        # motors are 16 bits, the accelerometer counts in g
         motors = tuple(data[name] / 65536 for name, _ in BODY_BLOCK[:4])
-        self.tell(Kind.BODIES, (time, *motors, *force))
+        self.tell(Kind.BODIES, (time, *motors, *force, *rates))
         self.listener(False)

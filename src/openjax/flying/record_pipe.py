@@ -30,7 +30,7 @@ class Kind(IntEnum):
     END = 6
 
 
-WIDTHS = {Kind.POSES: 16, Kind.BODIES: 8, Kind.CAPTURE: 14}
+WIDTHS = {Kind.POSES: 16, Kind.BODIES: 11, Kind.CAPTURE: 14}
 """Numbers in a row of `Samples`."""
 MEASURED = {Kind.POSES: 2, Kind.BODIES: 0, Kind.CAPTURE: 0}
 """Which of them is the time of the measurement."""

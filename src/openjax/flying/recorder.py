@@ -148,7 +148,9 @@ def keep(
     pipes = [loop, links]
     rest = {loop: b"", links: b""}
     due = time.perf_counter() + EVERY
-    while pipes and not book.is_over:
+    patience = CLOSING / 2.0
+    while pipes and not (book.is_over and (book.knows_all or patience <= 0.0)):
+        patience -= REST * book.is_over
         for pipe in wait(pipes, EVERY):
             data = os.read(pipe.fileno(), 1 << 20)
             rest[pipe] = book.take(rest[pipe] + data)
@@ -156,7 +158,7 @@ def keep(
                 pipes.remove(pipe)
         if time.perf_counter() >= due:
             due = time.perf_counter() + EVERY
-            book.write(time.perf_counter() - HELD_BACK)
+            book.write(book.time - HELD_BACK)
         time.sleep(REST)
     outcome = book.close()
     if not book.is_over and outcome.folder is not None:
@@ -177,7 +179,20 @@ class _Book:
         self._logs: dict[int, GameLog] = {}
         self._case_folder: CaseFolder | None = None
         self._vehicles = vehicles
+        self._newest = {"loop": -np.inf, "links": -np.inf}
         self.is_over = False
+
+    @property
+    def knows_all(self) -> bool:
+        """Whether the links have told all up to the loop's last tick."""
+        return self._newest["links"] >= self._newest["loop"]
+
+    @property
+    def time(self) -> float:
+        """The moment (s) of which both loop and links have told: on a busy machine what
+        they tell is read late.
+        """
+        return min(self._newest.values())
 
     def take(self, data: bytes) -> bytes:
         """Take in the records of these bytes; what is left of the last, incomplete one."""
@@ -193,9 +208,13 @@ class _Book:
 
     def _take_one(self, kind: Kind, number: int, data: bytes) -> None:
         if kind in WIDTHS:
-            self._rows[kind, number].frombytes(data)
+            rows = self._rows[kind, number]
+            rows.frombytes(data)
+            if kind is not Kind.CAPTURE:
+                self._newest["links"] = rows[MEASURED[kind] - WIDTHS[kind]]
         elif kind is Kind.TICK:
             self._record.add(data)
+            self._newest["loop"] = array("d", data)[1]
         elif kind is Kind.GAME:
             self._notes[number] = json.loads(data)
             self._logs.setdefault(number, GameLog(number))
@@ -223,7 +242,8 @@ class _Book:
                     self._case_folder.extend(log.name, piece)
                 if self._notes[number]["end"] and until > sent_at[-1]:
                     del self._logs[number]
-        self._forget(until - EVERY)
+        # a row's time is rounded when it is written
+        self._forget(until - REST)
 
     def _samples(self, i: int) -> Samples:
         """What was told of vehicle i and isn't forgotten."""

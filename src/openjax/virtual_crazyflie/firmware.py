@@ -35,6 +35,8 @@ from openjax.virtual_crazyflie.tables import (
     READ_ONLY_GROUP,
 )
 
+STEP = 0.002
+"""Seconds between two runs of its loop: 500 Hz."""
 LEVEL_AFTER = 0.5
 """Set-points older than this (s) are replaced by a level attitude at the same thrust
 (firmware: supervisor.c, a constant).

@@ -4,6 +4,7 @@ loss to order.
 
 import contextlib
 import heapq
+import math
 import random
 import socket
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from typing import Annotated
 from openjax.errors import UserError
 from openjax.flying.crtp import Port
 from openjax.ranges import Interval, Seed, check_intervals
+from openjax.virtual_crazyflie.firmware import STEP
 
 
 @dataclass(frozen=True)
@@ -85,10 +87,12 @@ class VirtualLink:
                     continue
                 jitter = self._random.random() * self.faults.jitter_ms
                 delay = 1e-3 * (self.faults.latency_ms + jitter)
+            # the firmware looks for packets at its steps, never before they came
+            due = STEP * math.ceil((time + delay) / STEP - 1e-6)
             # the count keeps packets of one moment in order, and heaps from comparing
             # peers
             self._count += 1
-            heapq.heappush(self._incoming, (time + delay, self._count, raw, peer))
+            heapq.heappush(self._incoming, (due, self._count, raw, peer))
 
     def next_due(self) -> float:
         """When the next packet in either direction is due; infinite if none waits."""

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from openjax.flying.endpoints import UDP_PORT
-from openjax.virtual_crazyflie.firmware import VirtualFirmware
+from openjax.virtual_crazyflie.firmware import STEP, VirtualFirmware
 from openjax.virtual_crazyflie.link import LinkFaults, VirtualLink
-from openjax.virtual_crazyflie.vehicles import STEP, VirtualVehicles
+from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 
 LONGEST_WAIT = 0.02
 """The vehicles are advanced at least this often (s)."""
@@ -47,6 +47,7 @@ class VirtualCrazyflies:
         except BaseException:
             self.close()
             raise
+        self._set_points = np.zeros((vehicles.number, 5), np.float32)
         self.uris = [f"udp://{host}:{link.port}" for link in self.links]
         self._steps = 0
 
@@ -96,11 +97,13 @@ class VirtualCrazyflies:
     def _advance(self, until: float) -> None:
         # a quotient of floats may lie a hair below its whole number
         steps = int(until / STEP + 1e-6) - self._steps
-        if steps < 1:
-            return
-        self.late += steps * STEP > LATE + LONGEST_WAIT
         latest = [firmware.set_point(self.time) for firmware in self.firmware]
         set_points = np.array(latest, np.float32)
+        if steps < 1 and (set_points == self._set_points).all():
+            return
+        self._set_points = set_points
+        steps = max(steps, 0)
+        self.late += steps * STEP > LATE + LONGEST_WAIT
         report = self.vehicles.advance(set_points, steps)
         self._steps += steps
         for i, firmware in enumerate(self.firmware):

@@ -16,8 +16,8 @@ from openjax.flying.controller import Pose
 from openjax.flying.crtp import compress_quaternion, expand_quaternion
 from openjax.flying.set_point import OFF, SetPoint, as_sent
 from openjax.flying.state import PoseSample
-from openjax.virtual_crazyflie.firmware import VirtualFirmware
-from openjax.virtual_crazyflie.vehicles import STEP, VirtualVehicles
+from openjax.virtual_crazyflie.firmware import STEP, VirtualFirmware
+from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 
 TICK = 0.01
 """s"""

@@ -17,10 +17,9 @@ from openjax.flying.set_point import ANGLES, OFF
 from openjax.vehicle import Vehicle, hover_state, make_drones_step, rotate, rotate_inverse
 from openjax.vehicle.effects import composition
 from openjax.vehicle.rate_controller import rate_controller
+from openjax.virtual_crazyflie.firmware import STEP
 from openjax.virtual_crazyflie.tables import Sensors
 
-STEP = 0.002
-"""Seconds of a step: the firmware's rate loop runs at 500 Hz."""
 ANGLE_GAIN = 6.0
 """Body rate asked for per angle error (1/s): proportional part of the firmware's
 attitude controller.
@@ -94,7 +93,9 @@ class VirtualVehicles:
         # who stands on the floor has its rotors at rest
         drones = drones.replace(rotor_speed=drones.rotor_speed * flying)
         drones = self._step.reset(vehicle, drones, jax.random.key(0))
-        flat, self._unflatten = ravel_pytree(drones)
+        gravity = jnp.zeros((self.number, 3)).at[:, 2].set(vehicle.gravity)
+        begin = (drones, gravity, jnp.zeros(self.number, bool))
+        flat, self._unflatten = ravel_pytree(begin)
         nothing = np.zeros((self.number, 5), np.float32)
         self._advance = compile_in_line(jax.jit(self._program).lower(flat, nothing, np.int32(1)))
         self._charge = float(battery)
@@ -111,7 +112,7 @@ class VirtualVehicles:
 
     def advance(self, set_points: np.ndarray, steps: int) -> Report:
         """What is sensed after `steps` steps under constant set-points (N, 5) float32,
-        see `SetPoint`.
+        see `SetPoint`; after none, what the motors are asked for by new ones.
         """
         self._state, report = self._advance(self._state, set_points, np.int32(steps))
         self.report = Report._make(np.asarray(leaf, np.float64) for leaf in report)
@@ -129,9 +130,8 @@ class VirtualVehicles:
         plant = composition.change_body(effects, complete, vehicle)
 
         def step(_, carry):
-            drones, _, has_crashed = carry
+            drones, _, _, has_crashed = carry
             command = commands(drones.quaternion, set_points)
-            motor, _ = jax.vmap(lambda d, c: rate_controller(plant, d, c, STEP))(drones, command)
             new = self._step(vehicle, drones, command, no_pillar, inactive, self._parameters)
             # from what the step did, so that the accelerometer feels every effect
             acceleration = (new.velocity - drones.velocity) / STEP
@@ -139,15 +139,15 @@ class VirtualVehicles:
             gravity = vehicle.gravity * jnp.array([0.0, 0.0, 1.0])
             acceleration = jnp.where(on_floor[:, None], 0.0, acceleration)
             force = jax.vmap(rotate_inverse)(new.quaternion, acceleration + gravity)
-            return new, (motor, force, on_floor), has_crashed | hit
+            return new, force, on_floor, has_crashed | hit
 
-        drones = self._unflatten(flat)
-        gravity = jnp.zeros((self.number, 3)).at[:, 2].set(vehicle.gravity)
-        no_one = jnp.zeros(self.number, bool)
-        nothing = (jnp.zeros((self.number, 4)), gravity, no_one)
-        drones, (motor, force, on_floor), has_crashed = jax.lax.fori_loop(
-            0, steps, step, (drones, nothing, no_one)
-        )
+        carry = (*self._unflatten(flat), jnp.zeros(self.number, bool))
+        *state, has_crashed = jax.lax.fori_loop(0, steps, step, carry)
+        drones, force, on_floor = state
+        # the loop has read the sensors of this moment, and its motors turn by that until
+        # the next one
+        command = commands(drones.quaternion, set_points)
+        motor, _ = jax.vmap(lambda d, c: rate_controller(plant, d, c, STEP))(drones, command)
         report = Report(
             position=drones.position,
             velocity=drones.velocity,
@@ -158,7 +158,7 @@ class VirtualVehicles:
             on_floor=on_floor,
             crashed=has_crashed,
         )
-        return ravel_pytree(drones)[0], report
+        return ravel_pytree(tuple(state))[0], report
 
     def voltage(self) -> np.ndarray:
         """(N,) V, of the batteries under their loads."""
