@@ -75,6 +75,12 @@ def test_an_airframe_is_registered_from_outside(tmp_path, monkeypatch):
         register_airframe("crazyflie", mjcf)
 
 
+REPEATED = """<worldbody><replicate count="1000"><replicate count="1000"><geom size=".1"/>
+</replicate></replicate>"""
+LARGE = """<asset><texture type="2d" name="t" builtin="flat" width="100000" height="100000"/></asset>
+<worldbody>"""
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -83,6 +89,18 @@ def test_an_airframe_is_registered_from_outside(tmp_path, monkeypatch):
         (lambda xml: xml.replace('name="rotor_3" site', 'name="rotor" site'), "no actuator named 'rotor_3'"),
         (lambda xml: xml.replace("<inertial pos=\"0 0 0\"", "<inertial pos=\"0 0 0.01\""), "inertial frame"),
         (lambda xml: "nothing", "not a readable MJCF"),
+        (lambda xml: xml.replace('data="0.025"', 'data="nan"'), "motor_time_constant is nan"),
+        (lambda xml: xml.replace('data="0.025"', 'data="0"'), r"motor_time_constant is 0.0; it must be in \[1e-4"),
+        (lambda xml: xml.replace('mass="0.0321"', 'mass="1e300"'), "mass is 1e"),
+        (lambda xml: xml.replace("0 0 -9.81", "0 0 9.81"), "gravity is -9.81"),
+        (lambda xml: xml.replace("0 0 -9.81", "1 0 -9.81"), "gravity .* along -z"),
+        (lambda xml: xml.replace("2.350347e-8", "-2.350347e-8"), "thrust_constant is -2"),
+        (lambda xml: xml.replace('gear="0 0 1 0 0 -0', 'gear="0 0 -1 0 0 -0', 1), "'rotor_1' must push along"),
+        (lambda xml: xml.replace('name="rotor_2" pos', 'name="rotor_2" euler="180 0 0" pos'), "'rotor_2' must push along"),
+        (lambda xml: xml.replace('pos="0.0304056 -0.0304056 0"', 'pos="0.0304056 0.0304056 0"'), "'rotor_1' is at"),
+        (lambda xml: xml.replace("0 -0.0308", "0 0.0308", 1), "two must be positive"),
+        (lambda xml: xml.replace("<worldbody>", REPEATED), "1e[+]06 copies"),
+        (lambda xml: xml.replace("<worldbody>", LARGE), "1e[+]10 cells"),
     ],
 )  # fmt: skip
 def test_a_model_that_is_no_vehicle_is_refused(tmp_path, change, reason):
@@ -90,6 +108,19 @@ def test_a_model_that_is_no_vehicle_is_refused(tmp_path, change, reason):
     path.write_text(change((assets_directory() / "crazyflie.xml").read_text()))
     with pytest.raises(UserError, match=reason):
         load_vehicle(path)
+
+
+def test_what_an_include_repeats_is_counted(tmp_path):
+    text = (assets_directory() / "crazyflie.xml").read_text()
+    (tmp_path / "vehicle.xml").write_text(
+        text.replace("<worldbody>", '<include file="more.xml"/><worldbody>')
+    )
+    (tmp_path / "more.xml").write_text(
+        '<mujoco><include file="vehicle.xml"/><worldbody><replicate count="100000000"><geom size=".1"/>'
+        "</replicate></worldbody></mujoco>"
+    )
+    with pytest.raises(UserError, match=r"more\.xml: <replicate> asks for 1e[+]08 copies"):
+        load_vehicle(tmp_path / "vehicle.xml")
 
 
 def test_a_missing_model_is_refused(tmp_path):

@@ -57,18 +57,20 @@ def flown(folder, seed: int, seconds: float):
     vehicles under commands that change at random.
     """
     rng = np.random.default_rng(seed)
-    vehicles = VirtualVehicles(load_vehicle(), [(0.4 * i, 0.0, 5.0) for i in range(3)])
+    vehicles = VirtualVehicles(load_vehicle(), [(0.4 * i, 0.0, 20.0) for i in range(3)])
     hover = nominal_airframe().hover_thrust
     poses, bodies = [[] for _ in range(3)], [[] for _ in range(3)]
     sent_at, commands = [], []
     command = np.tile(np.array(SetPoint(RATES, thrust=hover), np.float32), (3, 1))
     rates = np.zeros((3, 3))
     for tick in range(int(100 * seconds)):
-        rates = 0.9 * rates + rng.normal(0.0, 0.5, (3, 3))
+        if tick % 8 == 0:
+            rates = rng.uniform(-0.7, 0.7, (3, 3))
         q = vehicles.report.quaternion
         # random turns about level; columns: mode, roll, pitch, yaw rate, thrust
         level = np.stack([-4.0 * q[:, 1], -4.0 * q[:, 2], np.zeros(3)], 1)
-        thrust = np.clip(hover + rng.normal(0.0, 0.05, (3, 1)), 0.2, 0.9)
+        sinking = vehicles.report.velocity[:, 2:]
+        thrust = np.clip(hover - 0.1 * sinking + rng.normal(0.0, 0.03, (3, 1)), 0.2, 0.9)
         new = np.concatenate([np.full((3, 1), RATES), level + rates, thrust], 1)
         for step in range(ROWS):
             moment = (ROWS * tick + step) * STEP
@@ -98,12 +100,17 @@ def flown(folder, seed: int, seconds: float):
 
 
 @pytest.mark.slow
-def test_a_nominal_flight_is_read_as_one(tmp_path):
-    """Motors of 25 ms, and nothing that would have to be named."""
-    from openjax.gap.diagnosis import diagnose_case
+def test_the_rate_loop_of_a_nominal_flight_is_the_simulators(tmp_path):
+    """Motors logged a step late changed I and D by -0.2 to -0.5, a gyroscope that came
+    at 100 Hz P by 0.1.
+    """
+    from openjax.gap.channels.rate_loop import RateLoop
+    from openjax.gap.evidence import gather
+    from openjax.gap.model.library import Library
 
-    report = diagnose_case(flown(tmp_path, 0, 8.0))
-    assert not report.effects
-    for name in ("spin_up", "spin_down"):
-        low, high = report.identification.quantities[name].interval90
-        assert low < 0.025 < high
+    evidence = gather(flown(tmp_path, 0, 10.0), Library())
+    (loop,) = (channel for channel in evidence.channels if isinstance(channel, RateLoop))
+    change, error = loop.gain
+    assert abs(change[0]) < 0.01 and error[0] < 0.01
+    assert np.abs(change).max() < 0.1
+    assert not loop.acting()

@@ -21,7 +21,8 @@ import mujoco
 import numpy as np
 
 from openjax.vehicle.arena import Arena
-from openjax.vehicle.parameters import NOMINAL, Vehicle, find_mjcf, read_mjcf
+from openjax.vehicle.mjcf import read_mjcf
+from openjax.vehicle.parameters import NOMINAL, Vehicle, find_mjcf
 from openjax.vehicle.rigid_body import euler_step
 from openjax.vehicle.shapes import Seconds, Things, Vector
 from openjax.vehicle.solids import DRONE_RADIUS, solids_xml

@@ -1,14 +1,12 @@
 """The vehicle's parameters, read from its MJCF: the one source of these numbers."""
 
-from functools import lru_cache
 from pathlib import Path
 
 import flax.struct
 import jax.numpy as jnp
-import mujoco
-import numpy as np
 
 from openjax.errors import UserError, suggestion
+from openjax.vehicle.mjcf import read_mjcf
 from openjax.vehicle.shapes import Command, Hubs, Rotors, Scalar, Vector
 
 NOMINAL = "crazyflie"
@@ -20,19 +18,6 @@ AIRFRAMES: dict[str, str | Path] = {
 beside it: the Crazyflie 2.1 and the Crazyflie 2.1 Brushless, in the package's assets,
 and what `register_airframe` put there.
 """
-
-ROTORS = ("rotor_1", "rotor_2", "rotor_3", "rotor_4")
-BODY = "crazyflie"
-_NUMBERS = {
-    "thrust_constant": 1,
-    "max_rotor_speed": 1,
-    "motor_time_constant": 1,
-    "rate_kp": 3,
-    "rate_ki": 3,
-    "rate_kd": 3,
-    "rate_integral_limit": 3,
-}
-"""What an MJCF has in `<custom>`, and how many values."""
 
 
 @flax.struct.dataclass
@@ -73,64 +58,6 @@ def assets_directory() -> Path:
     raise UserError(
         f"crazyflie.xml is neither in {file.parents[1]}/assets nor in {file.parents[3]}/assets"
     )
-
-
-@lru_cache(maxsize=8)
-def read_mjcf(path: str) -> dict[str, np.ndarray]:
-    """Field of `Vehicle` -> float64 value, from the compiled model at `path`.
-
-    Raises:
-      UserError: the file isn't MJCF, or lacks something that a vehicle needs.
-    """
-    try:
-        model = mujoco.MjModel.from_xml_path(path)
-    except (ValueError, OSError) as error:
-        raise UserError(
-            f"{path}: not a readable MJCF model ({str(error).splitlines()[0]})"
-        ) from None
-    body = _find(model, path, "body", BODY)
-    # all equations here are about the centre of mass and the principal axes
-    is_turned = not np.allclose(model.body_iquat[body], [1, 0, 0, 0])
-    if is_turned or not np.allclose(model.body_ipos[body], 0):
-        raise UserError(
-            f"{path}: the inertial frame of {BODY!r} must lie in the body frame (pos 0, "
-            "diaginertia only)"
-        )
-    actuators = [_find(model, path, "actuator", name) for name in ROTORS]
-    sites = [_find(model, path, "site", name) for name in ROTORS]
-    # of a gear's six numbers the last is the torque about z per thrust, signed by the
-    # rotor's spin
-    torque_per_thrust = model.actuator_gear[actuators, 5]
-    numbers = {name: _number(model, path, name, size) for name, size in _NUMBERS.items()}
-    return {
-        "mass": model.body_mass[body],
-        "inertia": model.body_inertia[body].copy(),
-        "rotor_position": model.site_pos[sites],
-        "rotor_spin": np.sign(torque_per_thrust),
-        "torque_constant": np.abs(torque_per_thrust).mean() * numbers["thrust_constant"],
-        "motor_slowdown_ratio": np.float64(1.0),
-        "gravity": -model.opt.gravity[2],
-        **numbers,
-    }
-
-
-def _find(model, path, kind, name):
-    """The index of a named part of a model. Raises UserError where it has none."""
-    index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
-    if index < 0:
-        raise UserError(f"{path}: has no {kind} named {name!r}, which a vehicle needs")
-    return index
-
-
-def _number(model, path, name, size):
-    """The values of a `numeric`."""
-    index = _find(model, path, "numeric", name)
-    start = model.numeric_adr[index]
-    count = model.numeric_size[index]
-    if count != size:
-        raise UserError(f"{path}: numeric {name!r} holds {count} values, {size} would be right")
-    values = np.array(model.numeric_data[start : start + count])
-    return values[0] if size == 1 else values
 
 
 def register_airframe(name: str, mjcf: str | Path) -> None:
