@@ -3,7 +3,6 @@ whether the difference matters, and whether an effect can be, and is of a size t
 counts.
 """
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +25,6 @@ DETECTABLE = 2.0 * DECISION.standard_errors**2
 # errors of the rate loop's form are named as inertia; with .15 or .2 as much is right
 # on the cases tried.
 DOES = 0.15
-Measured = Mapping[tuple[str, str], tuple[float, float]]
 
 
 def difference(better: Validation, other: Validation) -> tuple[float, float, float]:
@@ -92,20 +90,22 @@ def log_odds(effects) -> float:
     return sum(CARDS[e].log_odds for e in effects)
 
 
-def practical(fit: SetFit, torque_response: Measured) -> bool:
+def practical(fit: SetFit) -> bool:
     """Whether every effect of a set is clearly of a size that matters in practice."""
-    return not too_small(fit, torque_response)
+    return not too_small(fit)
 
 
-def too_small(fit: SetFit, torque_response: Measured) -> tuple[str, ...]:
+def too_small(fit: SetFit) -> tuple[str, ...]:
     """The effects of a set that aren't clearly of a size that matters in practice (a
-    region of practical equivalence on the parameters, Kruschke 2018), by the replay or
-    by the `torque_response` that was measured: {(effect, parameter): (value,
-    deviation)}. What a card wants confirmed by the latter must be.
+    region of practical equivalence on the parameters, Kruschke 2018). What other
+    estimators named is.
     """
 
-    def of_replay(effect: str, names) -> bool:
+    def of_a_size(effect: str) -> bool:
         card = CARDS[effect]
+        names = [p.name for p in card.fitted] if card.departure else list(card.practical)
+        if not names or effect in fit.replay.told:
+            return True
         indices = [PLACE[effect, parameter] for parameter in names]
         shape = [PLACE[effect, parameter] for parameter in card.shape]
         free = np.flatnonzero(~np.isin(fit.index, shape))
@@ -120,28 +120,6 @@ def too_small(fit: SetFit, torque_response: Measured) -> tuple[str, ...]:
         least = np.array([card.practical[p] for p in names])
         least = least * fit.replay.size_factors[indices]
         return clearly_larger(away, covariance[np.ix_(rows, rows)], least)
-
-    def of_response(keys) -> bool:
-        return any(
-            abs(torque_response[e, p][0] - fit.replay.absent[PLACE[e, p]])
-            - REACH * torque_response[e, p][1]
-            > CARDS[e].practical[p] * fit.replay.size_factors[PLACE[e, p]]
-            for e, p in keys
-            if (e, p) in torque_response
-        )
-
-    def of_a_size(effect: str) -> bool:
-        card = CARDS[effect]
-        if card.needs_response or any(key in torque_response for key in card.confirmed_by):
-            # what confirms another effect of the set can't confirm this one as well
-            others = set(fit.effects) - {effect}
-            keys = [k for k in card.confirmed_by if k[0] not in others]
-            couples = bool(card.coupling) and of_replay(effect, card.coupling)
-            return couples or of_response(keys)
-        names = [p.name for p in card.fitted] if card.departure else card.practical
-        if not names:
-            return True
-        return of_replay(effect, names) or of_response([(effect, p) for p in names])
 
     return tuple(e for e in fit.effects if not of_a_size(e))
 

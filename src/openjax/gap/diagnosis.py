@@ -73,6 +73,11 @@ def _diagnose(case: Case, without, progress, reference, trims) -> Report:
 def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
     """The report that the evidence supports, beside what `trims` say changed."""
     selection = select(evidence)
+    if (torques := evidence.torques) is not None:
+        beside = torques.given(selection.fit.theta, selection.effects)
+        if beside.named != torques.named:
+            evidence = evidence.with_torques(beside)
+            selection = select(evidence)
     acting = {e: selection.probability(e) for e in selection.effects}
     acting |= {
         e: p
@@ -150,7 +155,7 @@ def worth_naming(shares_of: Callable[[list[str]], Split], effects: list[str]) ->
             if parts.effects[e].interval90[1] < least_share(e)
             or parts.effects[e].value < LEAST_SHARE
         ]
-        if not dropouts and parts.gap.reduction < 0.0:
+        if not dropouts and parts.gap.reduction < DECISION.least_gap:
             dropouts = [min(effects, key=lambda e: parts.effects[e].value)]
         if not dropouts:
             break

@@ -2,9 +2,7 @@
 channel.
 """
 
-from collections.abc import Collection
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -24,14 +22,12 @@ from openjax.gap.channels.pose import Pose, read_pose
 from openjax.gap.channels.radio import read_radio
 from openjax.gap.channels.rate_loop import read_rate_loop, with_motors
 from openjax.gap.decision import DECISION
-from openjax.gap.identification.changes import FARTHEST, change_of, comparable, conditional
-from openjax.gap.identification.estimates import EffectEstimates
 from openjax.gap.identification.quantities import Identification, identify
-from openjax.gap.identification.support import distance, support
 from openjax.gap.model.baseline import Baseline
 from openjax.gap.model.library import CARDS, Library, places
 from openjax.gap.model.nuisances import UNKNOWN_GAIN
 from openjax.gap.model.replay import Replay
+from openjax.gap.torque_causes import TORQUES, Torques, torques_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +49,8 @@ class Evidence:
     """What the vehicle is like while nothing acts; None where that isn't known."""
     identification: Identification | None = None
     """What the torques do in closed loop."""
+    torques: Torques | None = None
+    """What that says of causes; None where it isn't trusted."""
 
     @property
     def replay(self) -> Replay:
@@ -65,89 +63,33 @@ class Evidence:
         voltage was logged.
         """
         silent = any(t.voltage is None for t in self.tracks)
-        return silent and self.case.vehicle_file.motor.command == "pwm"
+        return silent and self.pwm
 
-    @cached_property
-    def change(self) -> EffectEstimates | None:
-        """What the torques' response tells beside the reference's; None where there is
-        none, or none to compare.
-        """
-        if self.baseline is None:
-            return None
-        case = self.identification
-        reference = self.baseline.identification
-        if not comparable(case, reference):
-            return None
-        return change_of(case.estimates, reference.estimates, self.baseline.theta)
+    @property
+    def pwm(self) -> bool:
+        """Whether motor commands are duty cycles."""
+        return self.case.vehicle_file.motor.command == "pwm"
 
-    def torque_response(
-        self, effects: Collection[str]
-    ) -> dict[tuple[str, str], tuple[float, float]]:
-        """{(effect, parameter): (value, standard deviation)} of what the torques'
-        response tells without a model of the loop, of effects that these logs can show;
-        beside a reference, if these `effects` alone have changed.
-        """
-        identification = self.identification
-        if self.change is not None:
-            free = {(e, p.name) for e in effects for p in CARDS[e].fitted}
-            free = free.union(*(CARDS[e].confirmed_by for e in effects))
-            if not free & set(self.change.names):
-                return {}
-            estimates = conditional(self.change, self.baseline.theta, free)
-        elif identification is not None and identification.trustworthy:
-            estimates = identification.estimates
-        else:
-            return {}
-        unseen = {e for e in self.library.physics if self.motion.exposure[e] == 0.0}
-        names = [key for key in estimates.names if key[0] not in unseen]
-        return {(effect, p): estimates.of(effect, p) for effect, p in names}
-
-    @cached_property
+    @property
     def silent(self) -> frozenset[str]:
-        """Effects of the library that only a response of the torques would confirm,
-        where none is told.
+        """Effects of the library that only the torques tell, at least at their usual
+        size, and that these don't.
         """
-        return frozenset(
-            e
-            for e in self.library.physics
-            if CARDS[e].needs_response and not self.torque_response((e,))
-        )
+        told = {*TORQUES} - {"motor_lag"} if self.torques is None else self.torques.hidden
+        return frozenset(told) & frozenset(self.library.physics)
 
-    def support(self, theta: np.ndarray) -> float:
-        """Nats by which what the replay doesn't weigh speaks for parameters theta (P,):
-        the identified torques, where they are trusted, and gusts under other vehicles.
-        """
-        return self._of_torques(theta) + self._of_gusts(theta)
-
-    def torque_nats(self, theta: np.ndarray) -> float:
-        """Nats by which the identified torques speak for parameters theta (P,) beside
-        others of the same prior odds: a yaw torque alone leaves roll and pitch as they
-        are, an inertia doesn't.
-        """
-        return self._of_response(theta, acts=True)
-
-    def _of_response(self, theta: np.ndarray, acts: bool = False) -> float:
-        """What `support` says of the identified torques; nothing where they aren't
-        trusted.
-        """
-        identification = self.identification
-        if identification is None or not identification.trustworthy:
-            return 0.0
-        pwm = self.case.vehicle_file.motor.command == "pwm"
-        return support(identification.estimates, theta, pwm, acts)
-
-    def _of_gusts(self, theta: np.ndarray) -> float:
+    def gust_nats(self, theta: np.ndarray) -> float:
+        """Nats by which gusts under other vehicles speak for parameters theta (P,)."""
         gusts = self.motion.gusts
         wakes = [places((e,)) for e in self.library.physics if CARDS[e].of_others]
         acts = any((theta[place] != self.replay.absent[place]).any() for place in wakes)
         return gusts.nats if gusts is not None and acts else 0.0
 
-    def _of_torques(self, theta: np.ndarray) -> float:
-        """Two questions: is this a usual vehicle, and is it the one that it was?"""
-        nats = self._of_response(theta)
-        if self.change is not None:
-            nats -= min(distance(self.change, theta), FARTHEST)
-        return nats
+    def with_torques(self, torques: Torques | None) -> "Evidence":
+        """The evidence with what the torques tell, in the replay as well."""
+        elsewhere = {*TORQUES} - {"motor_lag"} if torques is None else {*TORQUES}
+        told = {} if torques is None else torques.told
+        return replace(self, torques=torques, motion=self.motion.told(told, elsewhere))
 
 
 def gather(
@@ -184,7 +126,8 @@ def gather(
     if motion.gusts is not None:
         finding = {"gusts under others": motion.gusts.in_words()}
         sensors = replace(sensors, findings=sensors.findings | finding)
-    return Evidence(case, library, tracks, vehicles, sensors, channels, motion, baseline)
+    evidence = Evidence(case, library, tracks, vehicles, sensors, channels, motion, baseline)
+    return evidence.with_torques(None)
 
 
 def with_identification(evidence: Evidence) -> Evidence:
@@ -202,7 +145,14 @@ def with_identification(evidence: Evidence) -> Evidence:
     )
     if identification is not None:
         identification = replace(identification, gyroscope_gain=gain)
-    return replace(evidence, identification=identification)
+    evidence = replace(evidence, identification=identification)
+    absent, vehicle = evidence.replay.absent, evidence.vehicles[0]
+    torques = torques_of(identification, evidence.baseline, vehicle, evidence.pwm, absent)
+    if torques is not None:
+        exposure = evidence.motion.exposure
+        shown = (e for e in TORQUES if exposure.get(e, 0.0) > 0.0)
+        torques = replace(torques, effects=tuple(shown))
+    return evidence.with_torques(torques)
 
 
 def with_gyroscope_gain(case: Case, gain: float) -> Case:

@@ -6,15 +6,15 @@ effect. What the torques' response tells is printed as the response has it, sinc
 replay's torques are biased where motors answer gusts.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 from scipy.stats import truncnorm
 
 from openjax.gap.channels import Estimated, of_flights
-from openjax.gap.criteria import Measured
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.identification.quantities import REACH, Quantity
-from openjax.gap.identification.support import told_by
 from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import CARDS, PLACE, path_of
 from openjax.gap.report import Estimate
@@ -27,8 +27,11 @@ TINY = 1e-9  # of an error that is none at all
 def estimates(evidence: Evidence, fit: SetFit, effects) -> dict[str, dict[str, Estimate]]:
     """{effect: {parameter: its estimate}} of the named effects."""
     channels = {c.path: c for c in evidence.channels}
-    response = evidence.torque_response(fit.effects)
-    of_torques = told_by(response, fit.theta, fit.effects)
+    of_torques = {
+        (effect, p.name): (float(mean[k]), float(covariance[k, k]) ** 0.5)
+        for effect, (mean, covariance) in evidence.replay.told.items()
+        for k, p in enumerate(CARDS[effect].fitted)
+    }
     out = {}
     for effect in effects:
         channel = channels.get(path_of(effect))
@@ -100,7 +103,7 @@ def interval(estimate: Estimated, parameter) -> tuple[float, float]:
     return value - below, value + above
 
 
-def _of_physics(fit: SetFit, effect: str, parameter, of_torques: Measured) -> Estimated:
+def _of_physics(fit: SetFit, effect: str, parameter, of_torques: Mapping) -> Estimated:
     """A parameter of the fit, or of the torques as they were measured. Forms may be
     wrong by a share of the effect's largest parameter of that unit.
     """

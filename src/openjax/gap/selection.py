@@ -40,11 +40,15 @@ from openjax.gap.model.cross_validation import (
     promise,
     promise_unbounded,
 )
-from openjax.gap.model.hypotheses import SetFit, fit_set
+from openjax.gap.model.hypotheses import SetFit, fit_set, in_order
 from openjax.gap.model.library import CARDS, places
 from openjax.gap.model.table import Model, Table, build, with_effects
 
 NOTHING = frozenset()
+# What turns a vehicle all the time, which motors hold against.
+TRIMS = frozenset(
+    e for e, card in CARDS.items() if card.trim is not None and not card.scales_motion
+)
 LARGEST = 3  # effects of a set
 # Sets that are fitted in full, of those that the model promises as linearised around
 # nothing, and then around the best of these.
@@ -59,7 +63,7 @@ ROUNDS = 10  # of the chosen set's last fit, between which nuisances are worked 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
     """A fitted set of effects, judged on stretches left out; `support`: nats by which
-    the torques' response in closed loop speaks for it.
+    gusts under other vehicles speak for it.
     """
 
     fit: SetFit
@@ -96,6 +100,8 @@ class Selection:
 
     def probability(self, effect: str) -> float:
         """That the effect, or one that would do as well in its place, acts."""
+        if effect in self.search.given:
+            return self.search.evidence.torques.probability[effect]
         alike = {effect, *self.equivalent.get(effect, ())}
         return sum(w for effects, w in self.weights.items() if alike & effects)
 
@@ -135,9 +141,10 @@ def search_sets(evidence: Evidence) -> Search:
     """The sets that were worth fitting."""
     search = Search(evidence, testable(evidence))
     search.alone()
-    search.enumerate(search.nothing, FITTED)
+    search.enumerate(search.base, FITTED)
     search.enumerate(search.best, FITTED_AGAIN, search.beyond_bounds())
     search.fit_without_dropouts()
+    search.fit_trims_alone()
     return search
 
 
@@ -149,7 +156,7 @@ def testable(evidence: Evidence) -> dict[str, SetFit]:
     return {
         e: fit
         for e, fit in motion.singles.items()
-        if max(motion.exposure[e], fit.score - motion.nothing.score) >= DETECTABLE
+        if max(motion.exposure[e], fit.score - motion.base.score) >= DETECTABLE
     }
 
 
@@ -167,11 +174,27 @@ class Search:
     def nothing(self) -> Hypothesis:
         return self.of_set(NOTHING, self.evidence.motion.nothing)
 
+    @property
+    def given(self) -> frozenset[str]:
+        """The effects that other estimators named: part of every set."""
+        return frozenset(self.evidence.replay.told)
+
+    @cached_property
+    def base(self) -> Hypothesis:
+        """Of those alone."""
+        return self.of_set(self.given, self.evidence.motion.base)
+
+    @property
+    def candidates(self) -> list[Hypothesis]:
+        """The visited sets that hold them and stay within physical bounds."""
+        of_given = (h for key, h in self.hypotheses.items() if self.given <= key)
+        return [h for h in of_given if possible(h.fit)]
+
     def of_fit(self, fit: SetFit) -> Hypothesis:
         """The hypothesis of a fit."""
         table = build(fit, None)
         validation = cross_validate(table, with_effects(table))
-        support = self.evidence.support(fit.theta)
+        support = self.evidence.gust_nats(fit.theta)
         return Hypothesis(fit, validation, log_odds(fit.effects), support)
 
     def of_set(self, effects, near: SetFit) -> Hypothesis:
@@ -191,23 +214,26 @@ class Search:
         """The fit of a set, begun at a neighbouring set's."""
         if not key:
             return self.evidence.motion.nothing
-        if len(key) == 1:
-            return self.singles[next(iter(key))]
+        rest = key - self.given
+        if key == self.given:
+            return self.evidence.motion.base
+        if self.given < key and len(rest) == 1:
+            return self.singles[next(iter(rest))]
         start = near.theta.copy()
-        for new in key - set(near.effects):  # as it was alone
+        for new in rest - set(near.effects):  # as it was alone
             start[places((new,))] = self.singles[new].theta[places((new,))]
-        return fit_set(near.replay, [e for e in CARDS if e in key], start)
+        return fit_set(near.replay, in_order(key), start)
 
     def alone(self) -> None:
         """Judge the effects that explain most alone."""
         best = sorted(self.singles, key=lambda e: -self.singles[e].score)[:SIMPLER]
-        self.of_sets([{effect} for effect in best], self.nothing.fit)
+        self.of_sets([self.given | {effect} for effect in best], self.base.fit)
 
     def beyond_bounds(self) -> frozenset:
         """Effects that leave their physical bounds in the visited set of the largest
         score.
         """
-        return beyond_bounds(max(self.hypotheses.values(), key=lambda h: h.score).fit)
+        return beyond_bounds(max(self.hypotheses.values(), key=lambda h: h.score).fit) - self.given
 
     def enumerate(self, near: Hypothesis, most: int, without: frozenset = NOTHING) -> None:
         """Fit and judge the most promising sets of up to LARGEST effects that weren't
@@ -223,39 +249,50 @@ class Search:
                 k: promise_of(table, models[k])
                 - len(models[k].free)
                 + log_odds(k)
-                + self.torque_support(k)
+                + self._gust_nats(k)
                 for k in keys
             }
-            return [k for k in sorted(keys, key=lambda k: -score[k]) if score[k] > score[NOTHING]]
+            base = score[self.given]
+            return [k for k in sorted(keys, key=lambda k: -score[k]) if score[k] > base]
 
         candidates = rank(models, promise_unbounded)[: SCREENED * most]
-        best = rank([NOTHING, *(k for k in candidates if k != NOTHING)], promise)
+        best = rank([self.given, *(k for k in candidates if k != self.given)], promise)
         next_sets = [key for key in best if key not in self.hypotheses][:most]
-        next_sets += [key - {effect} for key in best[:SIMPLER] for effect in key]
+        next_sets += [key - {effect} for key in best[:SIMPLER] for effect in key - self.given]
         self.of_sets(next_sets, near.fit)
 
     def fit_without_dropouts(self) -> None:
         """Fit what is left of the best sets when effects that may not be named go: ones
         too small to change a simulator for, or beyond their bounds.
         """
-        torque_response = self.evidence.torque_response
         best = sorted(self.hypotheses.values(), key=lambda h: -h.score)[:FITTED_AGAIN]
         for hypothesis in best:
-            while dropouts := beyond_bounds(hypothesis.fit).union(
-                too_small(hypothesis.fit, torque_response(hypothesis.effects))
-            ):
-                left = set(hypothesis.effects) - dropouts
+            while dropouts := beyond_bounds(hypothesis.fit).union(too_small(hypothesis.fit)):
+                left = set(hypothesis.effects) - dropouts | self.given
+                if left == set(hypothesis.effects):
+                    break
                 hypothesis = self.of_set(left, hypothesis.fit)
 
-    def torque_support(self, key: frozenset) -> float:
-        """Nats by which the torques' response speaks for a set with each effect as it
-        was alone.
+    def fit_trims_alone(self) -> None:
+        """Fit what the best sets hold of a vehicle's trims, and nothing else of them."""
+        best = sorted(self.candidates, key=lambda h: -h.score)[:FITTED_AGAIN]
+        for hypothesis in best:
+            self.trims_of(hypothesis)
+
+    def trims_of(self, hypothesis: Hypothesis) -> Hypothesis:
+        """What a hypothesis holds of a vehicle's trims and of what others named: with
+        these alone a real vehicle is as a simulated one is without.
         """
-        theta = self.nothing.fit.theta.copy()
-        for effect in key:
+        trims = {e for e in hypothesis.effects if e in TRIMS}
+        return self.of_set(self.given | trims, hypothesis.fit)
+
+    def _gust_nats(self, key: frozenset) -> float:
+        """Nats by which gusts speak for a set with each effect as it was alone."""
+        theta = self.base.fit.theta.copy()
+        for effect in key - self.given:
             place = places((effect,))
             theta[place] = self.singles[effect].theta[place]
-        return self.evidence.support(theta)
+        return self.evidence.gust_nats(theta)
 
     def _model(self, table: Table, key: frozenset) -> Model:
         """A set in the table of another one."""
@@ -270,13 +307,13 @@ class Search:
         all motion.
         """
         sizes = range(LARGEST + 1)
-        every = (frozenset(s) for n in sizes for s in combinations(self.singles, n))
+        every = (self.given.union(s) for n in sizes for s in combinations(self.singles, n))
         return [s for s in every if sum(CARDS[e].scales_motion for e in s) <= 1]
 
     @property
     def best(self) -> Hypothesis:
         """Of the visited sets that are possible the one of the largest score."""
-        return max((h for h in self.hypotheses.values() if possible(h.fit)), key=lambda h: h.score)
+        return max(self.candidates, key=lambda h: h.score)
 
     def clearly_worse(self, other: Hypothesis, best: Hypothesis) -> bool:
         """Whether flights tell a hypothesis from the best one, and it leaves a gap so
@@ -290,7 +327,7 @@ class Search:
             return Gaps(
                 squares_of(other.validation).sum(0),
                 squares_of(best.validation).sum(0),
-                squares_of(self.nothing.validation).sum(0),
+                squares_of(self.trims_of(best).validation).sum(0),
             )
 
         gaps = gaps_by(lambda validation: validation.squares)
@@ -299,18 +336,15 @@ class Search:
 
     def equivalents(self, hypothesis: Hypothesis, effects) -> dict[str, list[str]]:
         """For each named effect those in whose place, of the sets visited, flights
-        don't tell the difference: not a wind that doesn't blow, which is a drag, but an
-        inertia that nothing could confirm.
+        don't tell the difference: not a wind that doesn't blow, which is a drag.
         """
 
         def is_rival(hypothesis: Hypothesis) -> bool:
-            if not possible(hypothesis.fit):
-                return False
-            response = self.evidence.torque_response(hypothesis.effects)
-            return self.evidence.silent.issuperset(too_small(hypothesis.fit, response))
+            return possible(hypothesis.fit) and practical(hypothesis.fit)
 
-        out = {}
-        for effect in effects:
+        torques = self.evidence.torques
+        out = {} if torques is None else dict(torques.equivalent)
+        for effect in set(effects) - self.given:
             rest = frozenset(hypothesis.effects) - {effect}
             alike = [
                 next(iter(key - rest))
@@ -328,20 +362,14 @@ class Search:
         the most evidence: its density, worth as many nats as blocks bear out (Pauli,
         Racugno, Ventura 2011), less what its parameters cost (Occam's factor).
         """
-        torque_response = self.evidence.torque_response
-        sets = [
-            h
-            for h in self.hypotheses.values()
-            if possible(h.fit) and practical(h.fit, torque_response(h.effects))
-        ]
+        sets = [h for h in self.candidates if practical(h.fit)] or [self.base]
         odds, costs = np.array([(h.log_odds, h.fit.cost) for h in sets]).T
         pairs = [[difference(a.validation, b.validation) for b in sets] for a in sets]
         _, errors, trust = np.moveaxis(np.array(pairs), 2, 0)
-        response = np.array([h.support for h in sets])
-        torques = np.array([self.evidence.torque_nats(h.fit.theta) for h in sets])
+        gusts = np.array([h.support for h in sets])
         # (D, sets)
-        density = weights @ np.array([h.validation.nats for h in sets]).T + response
-        nothing = sets.index(self.nothing)
+        density = weights @ np.array([h.validation.nats for h in sets]).T + gusts
+        trims = [self.trims_of(h).validation for h in sets]
         choices = []
         squares = np.array([h.validation.squares for h in sets])
         beside = {}  # of a best set: the squares of all sets, nuisances as it has them
@@ -353,18 +381,20 @@ class Search:
                 )
             sums = np.einsum("b,sbc->sc", weight, squares)
             sums_beside = np.einsum("b,sbc->sc", weight, beside[best])
+            trim = trims[best]
+            sums_of_trims = weight @ trim.squares
+            trims_beside = weight @ trim.squares_beside(sets[best].validation)
             out = worse(
                 nats[best] - nats,
                 errors[best],
-                Gaps(sums, sums[best], sums[nothing]),
-                Gaps(sums_beside, sums_beside[best], sums_beside[nothing]),
+                Gaps(sums, sums[best], sums_of_trims),
+                Gaps(sums_beside, sums_beside[best], trims_beside),
             )
-            # The response judges by itself: it counts no blocks, and its intervals hold
-            # the forms'.
-            out |= response[best] - response > DETECTABLE
+            # gusts judge by themselves: they count no blocks
+            out |= gusts[best] - gusts > DETECTABLE
             usual = ~out & (odds == odds[~out].max())
             first = int(np.argmax(np.where(usual, nats, -np.inf)))
-            evidence = trust[first] * (nats - nats[first]) - costs + torques
+            evidence = trust[first] * (nats - nats[first]) - costs
             choices.append(sets[int(np.argmax(np.where(usual, evidence, -np.inf)))])
         return choices
 

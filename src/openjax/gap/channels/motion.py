@@ -3,6 +3,7 @@ effect alone explains of it.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,7 +17,14 @@ from openjax.flights.track import GRID_PERIOD, Track
 from openjax.gap.channels.instruments import caused_by_commands, read_feedback
 from openjax.gap.channels.rate_loop import ROW_DELAY, RateLoop
 from openjax.gap.model.baseline import Baseline, with_days
-from openjax.gap.model.hypotheses import UNEXPOSED, SetFit, fit_set, fit_singles, model_noise
+from openjax.gap.model.hypotheses import (
+    UNEXPOSED,
+    SetFit,
+    fit_set,
+    fit_singles,
+    in_order,
+    model_noise,
+)
 from openjax.gap.model.library import CARDS, Library, numbers_of
 from openjax.gap.model.observer import TICKS
 from openjax.gap.model.prediction import RATES
@@ -156,6 +164,8 @@ class Motion:
     """
     gusts: Gusts | None = None
     """Under other vehicles, if these gust beyond doubt."""
+    elsewhere: frozenset[str] = frozenset()
+    """Effects that other estimators tell."""
 
     @cached_property
     def nothing(self) -> SetFit:
@@ -163,9 +173,28 @@ class Motion:
         return fit_set(self.replay, ())
 
     @cached_property
+    def base(self) -> SetFit:
+        """The fit of what other estimators named, and nothing else."""
+        return (
+            fit_set(self.replay, in_order(self.replay.told)) if self.replay.told else self.nothing
+        )
+
+    @cached_property
     def singles(self) -> dict[str, SetFit]:
-        """The fit of each effect alone; a calibration asks for none."""
-        return fit_singles(self.replay, self.library, self.exposure)
+        """The fit of each effect that the replay tells, beside those of `base`."""
+        visible = [
+            e
+            for e in self.library.physics
+            if e not in self.elsewhere and self.exposure[e] >= UNEXPOSED
+        ]
+        return fit_singles(self.replay, visible)
+
+    def told(self, effects: Mapping[str, tuple[np.ndarray, np.ndarray]], elsewhere) -> "Motion":
+        """The motion with the mean and covariance of `effects` by other estimators,
+        which tell all of `elsewhere`.
+        """
+        replay = dataclasses.replace(self.replay, told=dict(effects))
+        return dataclasses.replace(self, replay=replay, elsewhere=frozenset(elsewhere))
 
 
 def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:

@@ -4,7 +4,6 @@ What rows hide, and what a gyroscope's filter or a loop's noise makes of a respo
 the same in both, so a change shows where the response itself can't be told.
 """
 
-from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,6 @@ import numpy as np
 from openjax.gap.identification.estimates import EffectEstimates
 from openjax.gap.identification.quantities import Identification
 from openjax.gap.identification.row_errors import LARGEST_ERROR, NOISE_IN_GAIN
-from openjax.gap.identification.support import predict
 
 LAG = 0.0015  # s
 GAIN = 0.04  # as a logarithm
@@ -28,13 +26,10 @@ that seed both moved so, by 12 to 26 ms.
 ALONG_RIDGE = {
     **dict.fromkeys(("extra_up", "extra_down"), 1.0),
     **dict.fromkeys(("xx", "yy"), GAIN_OF_LAG),
+    "ratio": -GAIN_OF_LAG,
 }
 """{parameter: how it moves with a lag}."""
 LAGS = ("extra_up", "extra_down")
-FARTHEST = 11.0
-"""Nats: one case in ten lies several times as far off in each of five numbers, and that
-density is lower by as much (a mixture of normal distributions).
-"""
 
 
 def comparable(case: Identification | None, reference: Identification | None) -> bool:
@@ -49,13 +44,12 @@ def comparable(case: Identification | None, reference: Identification | None) ->
 
 
 def change_of(
-    case: EffectEstimates, reference: EffectEstimates, theta: np.ndarray
+    case: EffectEstimates, reference: EffectEstimates, start: np.ndarray
 ) -> EffectEstimates:
-    """The estimates of a case as if those of its reference had told the parameters
-    theta (P,), which are the vehicle's while nothing acts.
+    """The estimates of a case as if those of its reference had told the values `start`
+    (5,), which are the vehicle's while nothing acts.
     """
     gains = np.array([p not in LAGS for _, p in case.names])
-    start = predict(reference, theta)
     value = start + case.value - reference.value
     value[gains] = start[gains] * case.value[gains] / reference.value[gains]
     ridge = RIDGE * np.array([ALONG_RIDGE.get(p, 0.0) for _, p in case.names])
@@ -66,27 +60,9 @@ def change_of(
         covariance = covariance + estimates.without_rows / np.outer(scale, scale)
     scale = np.where(gains, value, 1.0)
     covariance = covariance * np.outer(scale, scale)
-    return replace(case, value=value, covariance=covariance, without_rows=covariance)
-
-
-def conditional(
-    estimates: EffectEstimates, theta: np.ndarray, free: Collection[tuple[str, str]]
-) -> EffectEstimates:
-    """The estimates of those parameters that are `free` if all others are as in theta
-    (P,): a lag alone is told more sharply than one beside an inertia.
-    """
-    inside = [k for k, name in enumerate(estimates.names) if name in free]
-    rest = [k for k, name in enumerate(estimates.names) if name not in free]
-    covariance = estimates.covariance
-    off = estimates.value - predict(estimates, theta)
-    across = covariance[np.ix_(inside, rest)]
-    gain = np.linalg.solve(covariance[np.ix_(rest, rest)], across.T).T
-    return replace(
-        estimates,
-        names=tuple(estimates.names[k] for k in inside),
-        value=estimates.value[inside] - gain @ off[rest],
-        covariance=covariance[np.ix_(inside, inside)] - gain @ across.T,
-    )
+    delays, errors = zip(case.clock, reference.clock, strict=True)
+    clock = float(delays[0] - delays[1]), float(np.hypot(*errors))
+    return replace(case, value=value, covariance=covariance, without_rows=covariance, clock=clock)
 
 
 def _of_noise(case: EffectEstimates, reference: EffectEstimates) -> np.ndarray:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openjax.flights.track import Track
 from openjax.gap.identification.search import TorqueFit
 
 
@@ -43,14 +42,13 @@ stands.
 """
 
 
-def of_fit(fit: TorqueFit, records: list[Track]) -> EffectEstimates:
+def of_fit(fit: TorqueFit, vehicle) -> EffectEstimates:
     """What a fit of the torques says of motor lag, inertia and yaw torque, with nothing
     taken for granted of the loop around them.
 
     A slow motor and a large inertia both weaken the response, and only the lag turns
     its phase: the covariance says how well these flights tell them apart.
     """
-    vehicle = records[0].vehicle
     up = float(vehicle.motor_time_constant)
     down = up * float(vehicle.motor_slowdown_ratio)
     roll, pitch, yaw = fit.value[3:6]

@@ -217,7 +217,7 @@ def identify(case: Case, one_clock: bool = True, gain_error: float = 0.0) -> Ide
         quantities_of(records, fit),
         responses(records, fit),
         (*reasons, *remarks),
-        of_fit(fit, records),
+        of_fit(fit, records[0].vehicle),
         trustworthy=not reasons,
         duty_cycles=duty_cycles,
         single_samples=reasons == (SAMPLES,),

@@ -5,6 +5,7 @@ Every set is fitted with the same nuisances and weighed by its marginal likeliho
 (Laplace's approximation), so that parameters cost what they are worth.
 """
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -109,7 +110,7 @@ def fit_set(
 
 def _at(replay: Replay, effects, theta: np.ndarray, columns=None) -> SetFit:
     """The set with these parameters (P,), linearised there."""
-    index, mean, precision = prior(effects, replay.absent, replay.size_factors)
+    index, mean, precision = replay.prior(effects)
     columns = replay.linearise(theta, index) if columns is None else columns
     grams = replay.grams(columns)
     off = theta[index] - mean
@@ -121,7 +122,7 @@ def _descend(fit: SetFit, iterations: int) -> SetFit:
     """Steps of Gauss and Newton, half of one that overshoots, while they gain
     anything.
     """
-    index, mean, precision = prior(fit.effects, fit.replay.absent, fit.replay.size_factors)
+    index, mean, precision = fit.replay.prior(fit.effects)
     # no step longer than three prior deviations: farther away the derivatives say
     # little
     reach = 3.0 * np.sqrt(np.diag(np.linalg.inv(precision)))
@@ -219,27 +220,34 @@ def without_nuisances(replay: Replay, residual: Rows, track: int) -> Rows:
     )
 
 
-def fit_singles(replay: Replay, library: Library, exposure) -> dict[str, SetFit]:
-    """The fit of every effect alone that the flights could show."""
-    visible_effects = [effect for effect in library.physics if exposure[effect] >= UNEXPOSED]
-    fits = side_by_side(lambda effect: fit_single(replay, effect), visible_effects)
-    return dict(zip(visible_effects, fits, strict=True))
+def fit_singles(replay: Replay, effects: Sequence[str]) -> dict[str, SetFit]:
+    """The fit of each of the effects, alone but for what other estimators told."""
+    fits = side_by_side(lambda effect: fit_single(replay, effect), effects)
+    return dict(zip(effects, fits, strict=True))
 
 
 def fit_single(replay: Replay, effect: str) -> SetFit:
-    """The fit of one effect alone."""
-    return fit_set(replay, (effect,), _best_start(replay, effect))
+    """The fit of one effect, alone but for what other estimators told."""
+    return fit_set(replay, in_order((effect, *replay.told)), _best_start(replay, effect))
+
+
+def in_order(effects: Collection[str]) -> tuple[str, ...]:
+    """The effects as the library has them."""
+    return tuple(e for e in CARDS if e in effects)
 
 
 def _starts(effect: str, replay: Replay) -> np.ndarray:
     """The starts (S, P) of an effect's search, as far from what the vehicle has while
-    nothing acts as its card says, for a vehicle of this size.
+    nothing acts as its card says, for a vehicle of this size; what other estimators
+    told is where they have it.
     """
     absent = replay.absent
     starts = np.repeat(absent[None], 1 + len(CARDS[effect].others), 0)
     at = places((effect,))
     starts[:, at] = [[p.start for p in CARDS[effect].fitted], *CARDS[effect].others]
     starts[:, at] = starts[:, at] * replay.size_factors[at] + (absent - ABSENT)[at]
+    for other, (mean, _) in replay.told.items():
+        starts[:, places((other,))] = mean
     return starts
 
 

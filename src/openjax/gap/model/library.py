@@ -91,24 +91,33 @@ def growths(vehicle) -> Parameters:
 
 
 def prior(
-    effects, absent: Parameters = ABSENT, size_factors: Parameters | None = None
+    effects, absent: Parameters = ABSENT, size_factors: Parameters | None = None, told=None
 ) -> tuple[Int[np.ndarray, " own"], Float[np.ndarray, " own"], Float[np.ndarray, "own own"]]:
     """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of
     physics effects, for a vehicle that has `absent` (P,) while nothing acts and sizes
-    that are `size_factors` (P,).
+    that are `size_factors` (P,). `told` {effect: (mean, covariance)}: by other
+    estimators.
     """
     index = []
-    mean = []
+    means = []
     blocks = []
     for effect in effects:
         card = CARDS[effect]
-        index += [PLACE[effect, p.name] for p in card.fitted]
-        mean += [p.mean for p in card.fitted]
-        common = [card.common * (p.name not in card.coupling) for p in card.fitted]
-        block = np.diag([p.spread**2 for p in card.fitted]) + np.outer(common, common)
-        blocks.append(block - BALANCE * block.mean() if card.balanced else block)
-    precision = np.linalg.inv(block_diagonal(blocks))
-    index = np.array(index, int)
-    size = np.ones(len(index)) if size_factors is None else size_factors[index]
-    mean = size * np.array(mean) + (absent - ABSENT)[index]
-    return index, mean, precision / np.outer(size, size)
+        at = places((effect,))
+        index += at.tolist()
+        if told and effect in told:
+            mean, covariance = told[effect]
+        else:
+            size = np.ones(len(at)) if size_factors is None else size_factors[at]
+            mean = size * np.array([p.mean for p in card.fitted]) + (absent - ABSENT)[at]
+            covariance = _usual_covariance(card) * np.outer(size, size)
+        means.append(mean)
+        blocks.append(np.linalg.inv(covariance))
+    return np.array(index, int), np.concatenate([np.zeros(0), *means]), block_diagonal(blocks)
+
+
+def _usual_covariance(card: Card) -> np.ndarray:
+    """(p, p) of an effect's parameters, as its card says."""
+    common = [card.common * (p.name not in card.coupling) for p in card.fitted]
+    block = np.diag([p.spread**2 for p in card.fitted]) + np.outer(common, common)
+    return block - BALANCE * block.mean() if card.balanced else block

@@ -7,7 +7,7 @@ marginalised per flight.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from scipy.linalg import solve_triangular
 
 from openjax.flights.track import Track
-from openjax.gap.model.library import ABSENT, CARDS, PLACE, STEP
+from openjax.gap.model.library import ABSENT, CARDS, PLACE, STEP, prior
 from openjax.gap.model.nuisances import OF_A_BLOCK, SIZE, columns_of
 from openjax.gap.model.prediction import FORCE, RATES, VELOCITY, Physics, make_physics
 from openjax.gap.model.whitening import Noise, first_noise, whiten
@@ -62,6 +62,8 @@ class Replay:
     # (P,) the vehicle while nothing acts
     absent: np.ndarray = field(default_factory=ABSENT.copy)
     mixing: np.ndarray | None = None  # (N, N) of `columns` to independent ones
+    # {effect: mean and covariance of its parameters} by other estimators
+    told: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
     @property
     def tracks(self) -> tuple[Track, ...]:
@@ -80,6 +82,10 @@ class Replay:
         size; every replay of the same physics shares them.
         """
         return self.physics.size_factors
+
+    def prior(self, effects: Collection[str]):
+        """As `library.prior` has it, of this vehicle and what others told of it."""
+        return prior(effects, self.absent, self.size_factors, self.told)
 
     @cached_property
     def flights(self) -> tuple[str, ...]:

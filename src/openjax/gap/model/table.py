@@ -21,7 +21,7 @@ import numpy as np
 
 from openjax.gap.model.blocks import block_diagonal
 from openjax.gap.model.hypotheses import SetFit
-from openjax.gap.model.library import CARDS, places, prior
+from openjax.gap.model.library import CARDS, places
 from openjax.gap.model.replay import FORCE, SKIP, block_count
 
 # s of the predictions whose errors are the gap; "acceleration" is the velocity that the
@@ -184,9 +184,7 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
     from there) or go.
     """
     remaining = tuple(e for e in table.fit.effects if e not in drop)
-    index, mean, precision = prior(
-        remaining, table.fit.replay.absent, table.fit.replay.size_factors
-    )
+    index, mean, precision = table.fit.replay.prior(remaining)
     derivatives_of_set = np.array([table.derivative[int(i)] for i in index], int)
     # The set's parameters: coefficients count from where they were fitted.
     mean = mean - table.fit.theta[index] if len(index) else mean

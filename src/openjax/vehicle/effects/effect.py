@@ -272,13 +272,6 @@ class Card:
     is spread. While nothing pushes they can have any value (Davies 1987), so the
     effect's size is asked with each as it was fitted.
     """
-    confirmed_by: tuple[tuple[str, str], ...] = ()
-    """(effect, parameter) of what the torques' response tells without a model of the
-    loop: where it is trusted, one of them must be of a size that matters as well. The
-    replay's torques are biased in closed loop, where motors answer gusts.
-    """
-    needs_response: bool = False
-    """Whether it isn't named, and not testable, where no response is trusted."""
     days: float | None = None
     """Of an effect that every vehicle has to some degree: the standard deviation of its
     parameters over a vehicle's days. None for others.

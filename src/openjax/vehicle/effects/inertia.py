@@ -81,10 +81,6 @@ EFFECT = Effect(
         nuisance_samples=dict.fromkeys(AXES, 0.3),
         sample=dict.fromkeys(AXES, 1.4),
         practical=dict.fromkeys(AXES, 0.05) | {"xy": 0.03},
-        # yaw tells the ratio of torque to the inertia about z
-        confirmed_by=(("inertia", "xx"), ("inertia", "yy"), ("yaw_torque", "ratio")),
-        # by the replay alone an inertia was right in 1 of 12 development cases
-        needs_response=True,
         days=0.0,
         next_flight="roll, pitch and yaw doublets with the motor commands logged.",
     ),

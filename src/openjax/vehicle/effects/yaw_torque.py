@@ -33,7 +33,6 @@ EFFECT = Effect(
         fitted=(Fitted("ratio", mean=1.0, spread=0.5, start=0.9, step=0.005),),
         sample={"ratio": 0.4},
         practical={"ratio": 0.05},
-        confirmed_by=(("yaw_torque", "ratio"),),
         days=0.0,
         next_flight="yaw doublets and steps.",
     ),
