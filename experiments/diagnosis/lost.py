@@ -54,7 +54,7 @@ def gains_over(selection, physics: frozenset[str]) -> dict:
     search = selection.search
     chosen = search.hypotheses[frozenset(selection.hypothesis.effects)]
     for effect in physics & set(search.singles):
-        search.of_set({effect}, search.nothing.fit)
+        search.of_set(search.given | {effect}, search.base.fit)
         if len(chosen.effects) < LARGEST:
             search.of_set({*chosen.effects, effect}, chosen.fit)
     with_it = [h for h in search.hypotheses.values() if physics & set(h.effects)]
@@ -70,8 +70,7 @@ def refused_by(evidence, better: list) -> str:
     allowed = [h for h in better if possible(h.fit)]
     if not allowed:
         return "bounds"
-    response = evidence.torque_response
-    large = any(practical(h.fit, response(h.effects)) for h in allowed)
+    large = any(practical(h.fit) for h in allowed)
     return "choice" if large else "size"
 
 

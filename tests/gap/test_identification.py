@@ -17,15 +17,15 @@ from openjax.flights.kinematics import Kinematics
 from openjax.flights.track import Track, own_tracks
 from openjax.gap import evidence
 from openjax.gap.identification.corrections import corrections
-from openjax.gap.identification.estimates import ESTIMATED, of_fit
+from openjax.gap.identification.estimates import of_fit
 from openjax.gap.identification.prediction_errors import NAMES
 from openjax.gap.identification.quantities import Identification, doubts, quantities_of
 from openjax.gap.identification.responses import responses
 from openjax.gap.identification.rotor_rows import rotor_rows
-from openjax.gap.identification.support import predict, support, told_by
 from openjax.gap.identification.torques import identify_torques
-from openjax.gap.model.library import ABSENT, PLACE
+from openjax.gap.model.library import ABSENT
 from openjax.gap.report.response import pictures_of
+from openjax.gap.torque_causes import torques_of
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.vehicle_file import load_vehicle_file
 
@@ -69,30 +69,21 @@ def test_truth_lies_within_three_deviations_in_gusts(records, name):
 
 def test_slow_motors_are_lag_and_not_inertia(records):
     record = records["slow motors"]
-    found = of_fit(identify_torques([record]), [record])
+    found = of_fit(identify_torques([record]), record.vehicle)
     lag, lag_error = found.of("motor_lag", "extra_up")
     inertia, inertia_error = found.of("inertia", "xx")
     assert abs(lag - 0.05) < 3.0 * lag_error < 0.045
     assert abs(inertia - 1.0) < 3.0 * inertia_error < 0.4
 
 
-def test_the_search_hears_that_slow_motors_are_no_inertia(records):
-    record = records["slow motors"]
-    found = of_fit(identify_torques([record]), [record])
-
-    def speaks_for(**values):
-        theta = ABSENT.copy()
-        for (effect, parameter), place in PLACE.items():
-            theta[place] = values.get(f"{effect}_{parameter}", theta[place])
-        return support(found, theta, pwm=False)
-
-    lag = speaks_for(motor_lag_extra_up=0.05, motor_lag_extra_down=0.05)
-    assert lag > -3.0
-    assert speaks_for() < lag - 8.0
-    assert speaks_for(inertia_xx=3.0, inertia_yy=3.0) < lag - 8.0
-    # A weaker thrust would turn it less, too.
-    both = {"inertia_xx": 0.8, "inertia_yy": 0.8, "inertia_zz": 0.8, "thrust_scale_scale": -0.2}
-    assert speaks_for(motor_lag_extra_up=0.05, motor_lag_extra_down=0.05, **both) > -5.0
+def test_slow_motors_are_named_and_nothing_beside(records):
+    named = {}
+    for name in ("nominal", "slow motors", "inertia"):
+        record = records[name]
+        estimates = of_fit(identify_torques([record]), record.vehicle)
+        found = SimpleNamespace(estimates=estimates, trustworthy=True)
+        named[name] = torques_of(found, None, record.vehicle, False, ABSENT).named
+    assert named == {"nominal": (), "slow motors": ("motor_lag",), "inertia": ("inertia",)}
 
 
 def test_motors_logged_late_are_a_clock(records):
@@ -108,7 +99,7 @@ def test_the_first_sentence_and_the_training_know_slow_motors(records):
     record = records["slow motors"]
     fit = identify_torques([record])
     found = Identification(
-        quantities_of([record], fit), responses([record], fit), (), of_fit(fit, [record])
+        quantities_of([record], fit), responses([record], fit), (), of_fit(fit, record.vehicle)
     )
     values, intervals = corrections(found, effects=())
     assert set(values) == {"motor_lag"}
@@ -123,7 +114,7 @@ def test_the_first_sentence_and_the_training_know_slow_motors(records):
     gains = np.array([1.0, 1.0, 1.0, 0.6, 0.6, 1.0, 1.0, 1.0, 1.0])
     other = replace(fit, value=gains * fit.value)
     numbers = quantities_of([record], other)
-    weaker = replace(found, quantities=numbers, estimates=of_fit(other, [record]))
+    weaker = replace(found, quantities=numbers, estimates=of_fit(other, record.vehicle))
     assert "inertia" in corrections(weaker, effects=())[0]
     assert "inertia" not in corrections(weaker, effects=("battery_sag",))[0]
     # yaw tells a torque over an inertia, which isn't flown with twice
@@ -219,23 +210,3 @@ def test_a_hover_that_hardly_turns_says_nothing_of_torques(monkeypatch, records)
     assert doubts([still], identify_torques([still], one_clock=False), one_clock=True)
     moving = records["nominal"]
     assert not doubts([moving], identify_torques([moving]), one_clock=True)
-
-
-def test_a_response_tells_back_the_parameters_that_made_it():
-    theta = ABSENT.copy()
-    truth = {
-        ("inertia", "xx"): 1.3,
-        ("inertia", "yy"): 1.2,
-        ("inertia", "zz"): 1.4,
-        ("thrust_scale", "scale"): 0.1,
-    }
-    for key, value in truth.items():
-        theta[PLACE[key]] = value
-    values = predict(SimpleNamespace(names=ESTIMATED, value=None), theta)
-    response = {key: (value, 0.1) for key, value in zip(ESTIMATED, values, strict=True)}
-    told = told_by(response, theta, ("inertia", "thrust_scale"))
-    for axis in ("xx", "yy", "zz"):
-        assert told["inertia", axis][0] == pytest.approx(truth["inertia", axis])
-    # yaw tells a ratio of two numbers, which may both be off
-    told = told_by(response, theta, ("inertia", "yaw_torque"))
-    assert set(told) == {("inertia", "xx"), ("inertia", "yy")}

@@ -13,8 +13,6 @@ from openjax.flights.flight import Case, Issue
 from openjax.gap.channels import Estimated
 from openjax.gap.decision import DECISION
 from openjax.gap.folders import diagnose_folder
-from openjax.gap.identification.changes import change_of, conditional
-from openjax.gap.identification.estimates import ESTIMATED, EffectEstimates
 from openjax.gap.model.baseline import Baseline, day_of, transfer
 from openjax.gap.model.library import ABSENT, PLACE
 from openjax.gap.reference import differs, join, trim_of, trimmed_before, with_some
@@ -134,23 +132,6 @@ def test_the_same_growth_says_more_of_a_sensor_than_of_what_gusts_shake():
     assert conformal_p(before, before)[0] > 0.5
     assert p_values["accelerometer"][1] == "accelerometer"
     assert p_values["accelerometer"][0] < DECISION.unknown < p_values["rates"][0]
-
-
-@pytest.mark.parametrize("lag", [0.0, 0.008])
-def test_a_lag_shows_beside_the_reference_where_rows_hide_it(lag):
-    def told(extra):
-        value = np.array([0.02 + extra, 0.02 + extra, 1.4, 1.4, 0.8])
-        fit = SimpleNamespace(turning=np.full(3, 50.0))
-        rows = np.diag(np.square([0.03, 0.03, 0.6, 0.6, 0.4]))
-        return EffectEstimates(ESTIMATED, value, rows, (0.0, 0.001), fit, 1e-6 * rows)
-
-    theta = ABSENT.copy()
-    change = change_of(told(lag), told(0.0), theta)
-    alone = conditional(change, theta, {("motor_lag", "extra_up"), ("motor_lag", "extra_down")})
-    value, deviation = alone.of("motor_lag", "extra_up")
-    assert value == pytest.approx(lag, abs=1e-9) and deviation < 0.003
-    # with an inertia beside it a lag is told less sharply
-    assert change.of("motor_lag", "extra_up")[1] > 0.005
 
 
 def test_days_of_a_reference_are_joined_and_another_vehicle_is_refused():

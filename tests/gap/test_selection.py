@@ -149,7 +149,7 @@ def of_one_effect(effect, values, covariance):
         index=index,
         hessian=np.linalg.inv(covariance),
         grams=np.zeros((1, 1 + len(index), 1)),
-        replay=SimpleNamespace(absent=ABSENT, size_factors=np.ones(len(ABSENT))),
+        replay=SimpleNamespace(absent=ABSENT, size_factors=np.ones(len(ABSENT)), told={}),
     )
 
 
@@ -158,22 +158,6 @@ def test_a_plane_whose_place_is_not_known_acts_if_its_push_is():
     along = np.array([0.4, 0.01])
     covariance = np.outer(along, along) + np.diag([1e-4, 1e-8])
     fit = of_one_effect("ground_effect", (0.5, 0.012), covariance)
-    assert practical(fit, {})
+    assert practical(fit)
     weak = of_one_effect("ground_effect", (0.05, 0.012), covariance)
-    assert not practical(weak, {})
-
-
-@pytest.mark.parametrize(
-    ("response", "told"),
-    [
-        ({}, False),
-        ({("inertia", "xx"): (1.0, 0.02)}, False),
-        ({("inertia", "xx"): (1.4, 0.02)}, True),
-    ],
-)
-def test_an_inertia_needs_the_response_whatever_the_replay_says(response, told):
-    fit = of_one_effect("inertia", (1.4, 1.4, 1.4, 0.01), 1e-6 * np.eye(4))
-    assert practical(fit, response) == told
-    # but nothing else makes one axis turn another
-    fit = of_one_effect("inertia", (1.0, 1.0, 1.0, 0.05), 1e-6 * np.eye(4))
-    assert practical(fit, response)
+    assert not practical(weak)
