@@ -17,14 +17,14 @@ from scipy.linalg import block_diag
 
 from openjax.gap.decision import DECISION
 from openjax.gap.identification.changes import change_of, comparable
-from openjax.gap.identification.estimates import EffectEstimates, of_fit
+from openjax.gap.identification.estimates import TORQUES, EffectEstimates, of_fit
 from openjax.gap.identification.quantities import TALKED_OF, Identification
 from openjax.gap.model.library import CARDS, PLACE
 from openjax.gap.model.nuisances import SIZE
 from openjax.gap.posterior import Cause, Explanation, explain
 from openjax.gap.quantities import Estimate
 
-TORQUES = ("motor_lag", "inertia", "yaw_torque")
+LAG, INERTIA, YAW = TORQUES
 NAMES = ("phase up", "phase down", "delay", "roll gain", "pitch gain", "yaw gain")
 """rad at TALKED_OF, s, and logarithms of one over the gain, of yaw of the gain."""
 TURN = 2.0 * np.pi * TALKED_OF  # rad/s
@@ -66,7 +66,7 @@ class Torques:
         for explanation in self.explanations:
             found = {}
             for cause, sizes in explanation.sizes.items():
-                effect = "motor_lag" if cause == LATE else cause
+                effect = LAG if cause == LATE else cause
                 if effect in chance:
                     share = float(np.mean(self._sizes_that_matter(cause, *sizes) > 1.0))
                     found[effect] = max(found.get(effect, 0.0), share)
@@ -107,7 +107,7 @@ class Torques:
             rivals = (c.name for c in CAUSES if c.name not in {*best, effect, LATE})
             least = self._best.weight * np.exp(-SWAP)
             alike = [c for c in rivals if weights.get(rest | {c}, 0.0) > least]
-            alike += ["command_latency"] * (effect == "motor_lag" and LATE in best)
+            alike += ["command_latency"] * (effect == LAG and LATE in best)
             if alike:
                 out[effect] = sorted(alike)
         return out
@@ -140,7 +140,7 @@ class Torques:
         size = mean + DRAWS[:, : len(mean)] @ root.T
         if cause == LATE:
             return size[:, 0] / DECISION.least_delay
-        if cause == "motor_lag":
+        if cause == LAG:
             return np.max([self._response(size[:, k], k) for k in (0, 1)], 0) / DECISION.least_lag
         return np.abs(size).max(1) / DECISION.least_gain
 
@@ -156,7 +156,7 @@ class Torques:
         """Mean and covariance of an effect's parameters, by a set that holds it."""
         start = self.assumed[[PLACE[effect, p.name] for p in CARDS[effect].fitted]]
         spread = np.array([p.spread for p in CARDS[effect].fitted])
-        if effect == "motor_lag":
+        if effect == LAG:
             return self._lag_parameters(start, explanation.sizes)
         mean, covariance = explanation.sizes[effect]
         value = start.copy()
@@ -168,8 +168,8 @@ class Torques:
     def _lag_parameters(self, start: np.ndarray, sizes: dict):
         """The lag's: what a delay does beside it is more of it."""
         value, covariance = start.copy(), np.eye(2) * 1e-8
-        if "motor_lag" in sizes:
-            mean, spread = sizes["motor_lag"]
+        if LAG in sizes:
+            mean, spread = sizes[LAG]
             lags = _lag(self.lags, mean)
             slopes = (1.0 + (TURN * lags) ** 2) / TURN
             value = value + lags - self.lags
@@ -181,7 +181,7 @@ class Torques:
 
 
 def _effects(causes) -> set[str]:
-    return {"motor_lag" if cause == LATE else cause for cause in causes}
+    return {LAG if cause == LATE else cause for cause in causes}
 
 
 def _columns(*rows: int) -> np.ndarray:
@@ -189,15 +189,15 @@ def _columns(*rows: int) -> np.ndarray:
 
 
 CAUSES = (
-    Cause("motor_lag", _columns(0, 1), np.array([[0.16, 0.12], [0.12, 0.16]]), -3.0),
+    Cause(LAG, _columns(0, 1), np.array([[0.16, 0.12], [0.12, 0.16]]), -3.0),
     Cause(LATE, _columns(2), np.array([[0.03**2]]), -3.0),
     Cause(
-        "inertia",
+        INERTIA,
         _columns(3, 4, 5) * np.array([1.0, 1.0, -1.0]),
         0.35**2 * (0.8 * np.ones((3, 3)) + 0.2 * np.eye(3)),
         -3.0,
     ),
-    Cause("yaw_torque", _columns(5), np.array([[0.25]]), -3.0),
+    Cause(YAW, _columns(5), np.array([[0.25]]), -3.0),
 )
 """Spreads cover what the effects' cards call usual: phases of lags up to 120 ms, moments
 of .5 to 2 times the assumed ones.
@@ -207,10 +207,10 @@ of .5 to 2 times the assumed ones.
 def usual_shift(effect: str, lags: np.ndarray) -> np.ndarray:
     """(n,) what an effect's usual size does to NAMES."""
     sample = CARDS[effect].sample
-    if effect == "motor_lag":
+    if effect == LAG:
         more = np.array([sample["extra_up"], sample["extra_down"]])
         return _columns(0, 1) @ (np.arctan(TURN * (lags + more)) - np.arctan(TURN * lags))
-    if effect == "inertia":
+    if effect == INERTIA:
         return np.log(sample["xx"]) * ALIKE
     return _columns(5)[:, 0] * np.log(sample["ratio"])
 
@@ -245,7 +245,7 @@ def _lags(absent: np.ndarray, vehicle) -> np.ndarray:
 
 def _extra(theta: np.ndarray) -> np.ndarray:
     """(2,) s of parameters theta (P,)."""
-    return np.array([theta[PLACE["motor_lag", p]] for p in ("extra_up", "extra_down")])
+    return np.array([theta[PLACE[LAG, p]] for p in ("extra_up", "extra_down")])
 
 
 def _lag(lags: np.ndarray, phase: np.ndarray) -> np.ndarray:
@@ -272,8 +272,8 @@ def _estimate(found: EffectEstimates, absent: np.ndarray, vehicle) -> Estimate:
 def _assumed_gains(theta: np.ndarray) -> np.ndarray:
     """(3,) logarithms of the gains that a vehicle of theta (P,) would show."""
     slope = _thrust_slope(theta)
-    xx, yy, zz = (theta[PLACE["inertia", axis]] for axis in ("xx", "yy", "zz"))
-    return np.log([xx / slope, yy / slope, theta[PLACE["yaw_torque", "ratio"]] * slope / zz])
+    xx, yy, zz = (theta[PLACE[INERTIA, axis]] for axis in ("xx", "yy", "zz"))
+    return np.log([xx / slope, yy / slope, theta[PLACE[YAW, "ratio"]] * slope / zz])
 
 
 def _damped(found: EffectEstimates, vehicle) -> EffectEstimates:

@@ -258,6 +258,9 @@ def _is_hidden(card, reading: Reading) -> bool:
     weightless = any(t.velocity is None and t.specific_force is None for t in reading.tracks)
     if card.needs_force and weightless:
         return True
+    # of motors that were made of the commands torques tell nothing
+    if weightless and not all(t.motors_logged for t in reading.tracks):
+        return True
     if (reading.blind and card.torque_axes) or (reading.lacks_thrust_map and card.thrust_map):
         return True
     return card.impossible is not None and any(

@@ -40,6 +40,7 @@ ESTIMATED = (
 """Yaw tells the ratio of torque to the inertia about z, so that inertia is taken as it
 stands.
 """
+TORQUES = tuple(dict.fromkeys(effect for effect, _ in ESTIMATED))
 
 
 def of_fit(fit: TorqueFit, vehicle) -> EffectEstimates:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from openjax.gap.decision import DECISION
+from openjax.gap.identification.estimates import TORQUES
 from openjax.gap.identification.quantities import TALKED_OF
 from openjax.gap.report.report import VERDICTS, VERDICTS_SINCE, WIDEST, Report
 from openjax.vehicle.effects import EFFECTS
@@ -34,11 +35,11 @@ def _testable(report: Report) -> Iterator[str]:
 
 
 def _shares(report: Report) -> Iterator[str]:
-    """What is named has a share."""
+    """What is named has a share of the gap, unless the torques told it."""
     for effect in report.named:
         share = report.shares.effects[effect]
         low, high = share.interval90
-        if min(high, share.value) < LEAST_SHARE:
+        if min(high, share.value) < LEAST_SHARE and effect not in TORQUES:
             yield f"{effect} is named with a share of {share.value:.3f} [{low:.3f}, {high:.3f}]"
         if not low - ROUNDING <= share.value <= high + ROUNDING:
             yield f"{effect} has a share of {share.value:.3f} outside of [{low:.3f}, {high:.3f}]"
@@ -46,7 +47,7 @@ def _shares(report: Report) -> Iterator[str]:
 
 def _predictions(report: Report) -> Iterator[str]:
     """What is named makes held-out predictions no worse."""
-    if report.named and report.gap.reduction < 0.0:
+    if set(report.named) - set(TORQUES) and report.gap.reduction < 0.0:
         yield f"{', '.join(report.named)}: held-out predictions get worse"
 
 
