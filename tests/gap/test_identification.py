@@ -120,7 +120,7 @@ def test_the_first_sentence_and_the_training_know_slow_motors(records):
     # yaw tells a torque over an inertia, which isn't flown with twice
     slow_yaw = replace(fit, value=np.where(np.arange(9) == 5, 0.6, 1.0) * fit.value)
     numbers = quantities_of([record], slow_yaw)
-    turning = replace(found, quantities=numbers, estimates=of_fit(slow_yaw, [record]))
+    turning = replace(found, quantities=numbers, estimates=of_fit(slow_yaw, record.vehicle))
     assert "yaw_torque" in corrections(turning, effects=())[0]
     assert "yaw_torque" not in corrections(turning, effects=("inertia",))[0]
     # A lag of 75 instead of 25 ms and 4 ms of delay, at 5 Hz.
