@@ -143,8 +143,9 @@ def with_identification(evidence: Evidence) -> Evidence:
     identification = identify(
         with_gyroscope_gain(in_time, gain), sensors.one_clock and sensors.motor_clock, gain_error
     )
-    if identification is not None:
-        identification = replace(identification, gyroscope_gain=gain)
+    if identification is None:
+        return evidence
+    identification = replace(identification, gyroscope_gain=gain)
     evidence = replace(evidence, identification=identification)
     absent, vehicle = evidence.replay.absent, evidence.vehicles[0]
     torques = torques_of(identification, evidence.baseline, vehicle, evidence.pwm, absent)
