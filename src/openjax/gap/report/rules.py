@@ -34,12 +34,18 @@ def _testable(report: Report) -> Iterator[str]:
             yield f"{effect} is named and not testable"
 
 
+def _told(report: Report) -> set[str]:
+    """Effects that the torques name, whatever short predictions show of them."""
+    does = report.identification
+    return set(TORQUES) if does is not None and does.trustworthy else set()
+
+
 def _shares(report: Report) -> Iterator[str]:
     """What is named has a share of the gap, unless the torques told it."""
     for effect in report.named:
         share = report.shares.effects[effect]
         low, high = share.interval90
-        if min(high, share.value) < LEAST_SHARE and effect not in TORQUES:
+        if min(high, share.value) < LEAST_SHARE and effect not in _told(report):
             yield f"{effect} is named with a share of {share.value:.3f} [{low:.3f}, {high:.3f}]"
         if not low - ROUNDING <= share.value <= high + ROUNDING:
             yield f"{effect} has a share of {share.value:.3f} outside of [{low:.3f}, {high:.3f}]"
@@ -47,7 +53,7 @@ def _shares(report: Report) -> Iterator[str]:
 
 def _predictions(report: Report) -> Iterator[str]:
     """What is named makes held-out predictions no worse."""
-    if set(report.named) - set(TORQUES) and report.gap.reduction < 0.0:
+    if set(report.named) - _told(report) and report.gap.reduction < 0.0:
         yield f"{', '.join(report.named)}: held-out predictions get worse"
 
 
