@@ -54,7 +54,7 @@ def gains_over(selection, physics: frozenset[str]) -> dict:
     search = selection.search
     chosen = search.hypotheses[frozenset(selection.hypothesis.effects)]
     for effect in physics & set(search.singles):
-        search.of_set(search.given | {effect}, search.base.fit)
+        search.of_set(search.torque_effects | {effect}, search.base.fit)
         if len(chosen.effects) < LARGEST:
             search.of_set({*chosen.effects, effect}, chosen.fit)
     with_it = [h for h in search.hypotheses.values() if physics & set(h.effects)]

@@ -22,10 +22,10 @@ from openjax.gap.identification.prediction_errors import NAMES
 from openjax.gap.identification.quantities import Identification, doubts, quantities_of
 from openjax.gap.identification.responses import responses
 from openjax.gap.identification.rotor_rows import rotor_rows
+from openjax.gap.identification.torque_causes import torques_of
 from openjax.gap.identification.torques import identify_torques
 from openjax.gap.model.library import ABSENT
 from openjax.gap.report.response import pictures_of
-from openjax.gap.torque_causes import torques_of
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.vehicle_file import load_vehicle_file
 
@@ -82,7 +82,7 @@ def test_slow_motors_are_named_and_nothing_beside(records):
         record = records[name]
         estimates = of_fit(identify_torques([record]), record.vehicle)
         found = SimpleNamespace(estimates=estimates, trustworthy=True)
-        named[name] = torques_of(found, None, record.vehicle, False, ABSENT).named
+        named[name] = torques_of(found, None, record.vehicle, False, ABSENT).names
     assert named == {"nominal": (), "slow motors": ("motor_lag",), "inertia": ("inertia",)}
 
 

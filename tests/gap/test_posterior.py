@@ -11,10 +11,9 @@ import pytest
 from openjax.gap.identification.changes import change_of
 from openjax.gap.identification.estimates import ESTIMATED, EffectEstimates
 from openjax.gap.identification.search import TorqueFit
+from openjax.gap.identification.torque_causes import TORQUES, torques_of
 from openjax.gap.model.library import ABSENT, PLACE
-from openjax.gap.posterior import Cause, explain
-from openjax.gap.quantities import Estimate
-from openjax.gap.torque_causes import TORQUES, torques_of
+from openjax.gap.posterior import Cause, Estimate, explain
 from openjax.vehicle import load_vehicle
 
 VEHICLE = load_vehicle()
@@ -82,38 +81,38 @@ def told(pwm=False, baseline=None, **values):
     ],
 )  # fmt: skip
 def test_what_acts_on_torques_is_named_and_nothing_beside(values, named):
-    assert set(told(**values).named) == set(named)
+    assert set(told(**values).names) == set(named)
 
 
 def test_a_delay_beside_a_nominal_lag_may_be_a_late_command():
     torques = told(delay=0.03)
-    assert torques.named == ("motor_lag",)
+    assert torques.names == ("motor_lag",)
     assert "command_latency" in torques.equivalent["motor_lag"]
-    mean, covariance = torques.told["motor_lag"]
+    mean, covariance = torques.parameters["motor_lag"]
     assert np.abs(mean - 0.03).max() < 2.0 * covariance[0, 0] ** 0.5 < 0.015
 
 
 def test_what_a_weaker_thrust_does_to_gains_is_no_inertia():
     torques = told(roll=0.75, pitch=0.75, yaw=0.75)
-    assert "inertia" in torques.named
+    assert "inertia" in torques.names
     theta = ABSENT.copy()
     theta[PLACE["thrust_scale", "scale"]] = -0.25
-    assert torques.given(theta, ("thrust_scale",)).named == ()
+    assert torques.with_thrust_of(theta, ("thrust_scale",)).names == ()
 
 
 def test_gains_of_duty_cycles_tell_the_map_and_lags_the_motors():
     slow = told(pwm=True, up=0.07, down=0.07, roll=0.6, pitch=0.6, yaw=0.6)
-    assert slow.named == ("motor_lag",)
+    assert slow.names == ("motor_lag",)
 
 
 def test_a_fit_whose_damping_is_no_rotors_says_less_of_inertia():
-    assert "inertia" in told(roll=0.7, pitch=0.7, yaw=0.7).named
-    assert "inertia" not in told(roll=0.7, pitch=0.7, yaw=0.7, damping=6.0).named
+    assert "inertia" in told(roll=0.7, pitch=0.7, yaw=0.7).names
+    assert "inertia" not in told(roll=0.7, pitch=0.7, yaw=0.7, damping=6.0).names
 
 
 def test_poor_flights_hide_an_inertia_and_good_ones_do_not():
-    assert told().hidden == frozenset()
-    assert "inertia" in told(error=0.6).hidden
+    assert told().untestable == frozenset()
+    assert "inertia" in told(error=0.6).untestable
     assert set(told().probability) == set(TORQUES)
 
 
@@ -129,7 +128,7 @@ def test_a_lag_shows_beside_the_reference_where_rows_hide_it(lag):
 
     baseline = SimpleNamespace(identification=read(0.0))
     torques = torques_of(read(lag), baseline, VEHICLE, False, ABSENT)
-    assert torques.named == (("motor_lag",) if lag else ())
+    assert torques.names == (("motor_lag",) if lag else ())
     start = np.array([0.0, 0.0, 1.0, 1.0, 1.0])
     change = change_of(read(lag).estimates, read(0.0).estimates, start)
     assert change.of("motor_lag", "extra_up")[0] == pytest.approx(lag)

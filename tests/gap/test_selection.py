@@ -149,7 +149,7 @@ def of_one_effect(effect, values, covariance):
         index=index,
         hessian=np.linalg.inv(covariance),
         grams=np.zeros((1, 1 + len(index), 1)),
-        replay=SimpleNamespace(absent=ABSENT, size_factors=np.ones(len(ABSENT)), told={}),
+        replay=SimpleNamespace(absent=ABSENT, size_factors=np.ones(len(ABSENT)), other_sizes={}),
     )
 
 

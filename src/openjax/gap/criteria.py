@@ -104,7 +104,7 @@ def too_small(fit: SetFit) -> tuple[str, ...]:
     def of_a_size(effect: str) -> bool:
         card = CARDS[effect]
         names = [p.name for p in card.fitted] if card.departure else list(card.practical)
-        if not names or effect in fit.replay.told:
+        if not names or effect in fit.replay.other_sizes:
             return True
         indices = [PLACE[effect, parameter] for parameter in names]
         shape = [PLACE[effect, parameter] for parameter in card.shape]

@@ -74,8 +74,8 @@ def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
     """The report that the evidence supports, beside what `trims` say changed."""
     selection = select(evidence)
     if (torques := evidence.torques) is not None:
-        beside = torques.given(selection.fit.theta, selection.effects)
-        if beside.named != torques.named:
+        beside = torques.with_thrust_of(selection.fit.theta, selection.effects)
+        if beside.names != torques.names:
             evidence = evidence.with_torques(beside)
             selection = select(evidence)
     acting = {e: selection.probability(e) for e in selection.effects}
@@ -91,12 +91,12 @@ def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
     of_days = trimmed_before(theta, selection.effects, evidence.baseline, vehicle, trims)
     old = of_days | forbidden(theta, selection.effects, vehicle)
     if check.mostly_unknown:  # what acts is something else
-        old |= set(selection.effects) - selection.search.given
+        old |= set(selection.effects) - selection.search.torque_effects
     candidates = [e for e, p in acting.items() if p >= 0.5 and e not in old]
     parts = worth_naming(
         lambda names: split(evidence, selection, check.excess, names),
         candidates,
-        selection.search.given,
+        selection.search.torque_effects,
     )
     present = {e: acting[e] for e in parts.effects}
     rejects = (set(candidates) | old) - set(present)
@@ -147,16 +147,18 @@ def forbidden(theta: np.ndarray, effects: Iterable[str], vehicle) -> set[str]:
 
 
 def worth_naming(
-    shares_of: Callable[[list[str]], Split], effects: list[str], given: Collection[str] = ()
+    shares_of: Callable[[list[str]], Split],
+    effects: list[str],
+    torque_effects: Collection[str] = (),
 ) -> Split:
     """The shares of those of the `effects` that have one, and that make held-out
     predictions better; `shares_of` splits the gap. Of the motion's effects it must be
-    larger than errors of the others' forms. What other estimators named (`given`) stays:
+    larger than errors of the others' forms. What other estimators named (`torque_effects`) stays:
     a lag hides from predictions over a quarter of a second, and not from who trains a
     policy with it.
     """
     parts = shares_of(effects)
-    while optional := [e for e in effects if e not in given]:
+    while optional := [e for e in effects if e not in torque_effects]:
         dropouts = [
             e
             for e in optional

@@ -22,12 +22,13 @@ from openjax.gap.channels.pose import Pose, read_pose
 from openjax.gap.channels.radio import read_radio
 from openjax.gap.channels.rate_loop import read_rate_loop, with_motors
 from openjax.gap.decision import DECISION
+from openjax.gap.identification.estimates import GAINS, TORQUES
 from openjax.gap.identification.quantities import Identification, identify
+from openjax.gap.identification.torque_causes import Torques, torques_of
 from openjax.gap.model.baseline import Baseline
 from openjax.gap.model.library import CARDS, Library, places
 from openjax.gap.model.nuisances import UNKNOWN_GAIN
 from openjax.gap.model.replay import Replay
-from openjax.gap.torque_causes import TORQUES, Torques, torques_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +76,8 @@ class Evidence:
         """Effects of the library that only the torques tell, at least at their usual
         size, and that these don't.
         """
-        told = {*TORQUES} - {"motor_lag"} if self.torques is None else self.torques.hidden
-        return frozenset(told) & frozenset(self.library.physics)
+        untestable = {*GAINS} if self.torques is None else self.torques.untestable
+        return frozenset(untestable) & frozenset(self.library.physics)
 
     def gust_nats(self, theta: np.ndarray) -> float:
         """Nats by which gusts under other vehicles speak for parameters theta (P,)."""
@@ -87,9 +88,9 @@ class Evidence:
 
     def with_torques(self, torques: Torques | None) -> "Evidence":
         """The evidence with what the torques tell, in the replay as well."""
-        elsewhere = {*TORQUES} - {"motor_lag"} if torques is None else {*TORQUES}
-        told = {} if torques is None else torques.told
-        return replace(self, torques=torques, motion=self.motion.told(told, elsewhere))
+        elsewhere = {*GAINS} if torques is None else {*TORQUES}
+        sizes = {} if torques is None else torques.parameters
+        return replace(self, torques=torques, motion=self.motion.with_sizes(sizes, elsewhere))
 
 
 def gather(
@@ -147,12 +148,13 @@ def with_identification(evidence: Evidence) -> Evidence:
         return evidence
     identification = replace(identification, gyroscope_gain=gain)
     evidence = replace(evidence, identification=identification)
-    absent, vehicle = evidence.replay.absent, evidence.vehicles[0]
+    absent = evidence.replay.absent
+    vehicle = evidence.vehicles[0]
     torques = torques_of(identification, evidence.baseline, vehicle, evidence.pwm, absent)
     if torques is not None:
         exposure = evidence.motion.exposure
-        shown = (e for e in TORQUES if exposure.get(e, 0.0) > 0.0)
-        torques = replace(torques, effects=tuple(shown))
+        visible = (e for e in TORQUES if exposure.get(e, 0.0) > 0.0)
+        torques = replace(torques, effects=tuple(visible))
     return evidence.with_torques(torques)
 
 

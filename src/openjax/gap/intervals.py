@@ -29,7 +29,7 @@ def estimates(evidence: Evidence, fit: SetFit, effects) -> dict[str, dict[str, E
     channels = {c.path: c for c in evidence.channels}
     of_torques = {
         (effect, p.name): (float(mean[k]), float(covariance[k, k]) ** 0.5)
-        for effect, (mean, covariance) in evidence.replay.told.items()
+        for effect, (mean, covariance) in evidence.replay.other_sizes.items()
         for k, p in enumerate(CARDS[effect].fitted)
         if p.name not in CARDS[effect].coupling
     }

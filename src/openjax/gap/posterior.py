@@ -9,15 +9,27 @@ Learning, appendix A).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
 
-from openjax.gap.quantities import Estimate
-
 LARGEST = 3  # causes of a set
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """By how much the quantities `names` (n,) differ from the assumed ones."""
+
+    names: tuple[str, ...]
+    value: Float[np.ndarray, " quantities"]
+    covariance: Float[np.ndarray, "quantities quantities"]
+
+    def with_doubts(self, directions: Float[np.ndarray, "quantities doubts"], sizes) -> "Estimate":
+        """The estimate where each direction (n, k) may be off by its size (k,) as well."""
+        columns = np.asarray(directions) * np.asarray(sizes)
+        return replace(self, covariance=self.covariance + columns @ columns.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,24 +55,24 @@ class Explanation:
 def explain(estimate: Estimate, causes: Sequence[Cause]) -> list[Explanation]:
     """All sets of at most `LARGEST` of the causes, the likeliest first."""
     sets = [s for n in range(LARGEST + 1) for s in combinations(causes, n)]
-    found = [_explained(estimate, chosen) for chosen in sets]
-    nats = np.array([density for density, _ in found])
+    explanations = [_explanation(estimate, members) for members in sets]
+    nats = np.array([density for density, _ in explanations])
     weights = np.exp(nats - nats.max())
     weights /= weights.sum()
     order = np.argsort(-weights)
-    return [Explanation(float(weights[k]), found[k][1]) for k in order]
+    return [Explanation(float(weights[k]), explanations[k][1]) for k in order]
 
 
-def _explained(estimate: Estimate, chosen: Sequence[Cause]):
+def _explanation(estimate: Estimate, members: Sequence[Cause]):
     """Log of prior odds times evidence of a set, and the sizes of its causes."""
     covariance = estimate.covariance.copy()
-    for cause in chosen:
+    for cause in members:
         covariance += cause.loads @ cause.spread @ cause.loads.T
-    solved = np.linalg.solve(covariance, estimate.value)
-    nats = -0.5 * estimate.value @ solved - 0.5 * np.linalg.slogdet(covariance)[1]
+    scores = np.linalg.solve(covariance, estimate.value)
+    nats = -0.5 * estimate.value @ scores - 0.5 * np.linalg.slogdet(covariance)[1]
     sizes = {}
-    for cause in chosen:
+    for cause in members:
         gain = cause.spread @ cause.loads.T
         reduction = gain @ np.linalg.solve(covariance, gain.T)
-        sizes[cause.name] = (gain @ solved, cause.spread - reduction)
-    return float(nats) + sum(cause.log_odds for cause in chosen), sizes
+        sizes[cause.name] = (gain @ scores, cause.spread - reduction)
+    return float(nats) + sum(cause.log_odds for cause in members), sizes

@@ -43,13 +43,13 @@ from openjax.gap.model.cross_validation import (
 from openjax.gap.model.hypotheses import SetFit, fit_set, in_order
 from openjax.gap.model.library import CARDS, places
 from openjax.gap.model.table import Model, Table, build, with_effects
+from openjax.gap.posterior import LARGEST
 
 NOTHING = frozenset()
 # What turns a vehicle all the time, which motors hold against.
 TRIMS = frozenset(
     e for e, card in CARDS.items() if card.trim is not None and not card.scales_motion
 )
-LARGEST = 3  # effects of a set
 # Sets that are fitted in full, of those that the model promises as linearised around
 # nothing, and then around the best of these.
 FITTED = 10
@@ -100,7 +100,7 @@ class Selection:
 
     def probability(self, effect: str) -> float:
         """That the effect, or one that would do as well in its place, acts."""
-        if effect in self.search.given:
+        if effect in self.search.torque_effects:
             return self.search.evidence.torques.probability[effect]
         alike = {effect, *self.equivalent.get(effect, ())}
         return sum(w for effects, w in self.weights.items() if alike & effects)
@@ -175,20 +175,20 @@ class Search:
         return self.of_set(NOTHING, self.evidence.motion.nothing)
 
     @property
-    def given(self) -> frozenset[str]:
+    def torque_effects(self) -> frozenset[str]:
         """The effects that other estimators named: part of every set."""
-        return frozenset(self.evidence.replay.told)
+        return frozenset(self.evidence.replay.other_sizes)
 
     @cached_property
     def base(self) -> Hypothesis:
         """Of those alone."""
-        return self.of_set(self.given, self.evidence.motion.base)
+        return self.of_set(self.torque_effects, self.evidence.motion.base)
 
     @property
     def candidates(self) -> list[Hypothesis]:
         """The visited sets that hold them and stay within physical bounds."""
-        of_given = (h for key, h in self.hypotheses.items() if self.given <= key)
-        return [h for h in of_given if possible(h.fit)]
+        with_these = (h for key, h in self.hypotheses.items() if self.torque_effects <= key)
+        return [h for h in with_these if possible(h.fit)]
 
     def of_fit(self, fit: SetFit) -> Hypothesis:
         """The hypothesis of a fit."""
@@ -214,10 +214,10 @@ class Search:
         """The fit of a set, begun at a neighbouring set's."""
         if not key:
             return self.evidence.motion.nothing
-        rest = key - self.given
-        if key == self.given:
+        rest = key - self.torque_effects
+        if key == self.torque_effects:
             return self.evidence.motion.base
-        if self.given < key and len(rest) == 1:
+        if self.torque_effects < key and len(rest) == 1:
             return self.singles[next(iter(rest))]
         start = near.theta.copy()
         for new in rest - set(near.effects):  # as it was alone
@@ -227,13 +227,16 @@ class Search:
     def alone(self) -> None:
         """Judge the effects that explain most alone."""
         best = sorted(self.singles, key=lambda e: -self.singles[e].score)[:SIMPLER]
-        self.of_sets([self.given | {effect} for effect in best], self.base.fit)
+        self.of_sets([self.torque_effects | {effect} for effect in best], self.base.fit)
 
     def beyond_bounds(self) -> frozenset:
         """Effects that leave their physical bounds in the visited set of the largest
         score.
         """
-        return beyond_bounds(max(self.hypotheses.values(), key=lambda h: h.score).fit) - self.given
+        return (
+            beyond_bounds(max(self.hypotheses.values(), key=lambda h: h.score).fit)
+            - self.torque_effects
+        )
 
     def enumerate(self, near: Hypothesis, most: int, without: frozenset = NOTHING) -> None:
         """Fit and judge the most promising sets of up to LARGEST effects that weren't
@@ -252,13 +255,17 @@ class Search:
                 + self._gust_nats(k)
                 for k in keys
             }
-            base = score[self.given]
+            base = score[self.torque_effects]
             return [k for k in sorted(keys, key=lambda k: -score[k]) if score[k] > base]
 
         candidates = rank(models, promise_unbounded)[: SCREENED * most]
-        best = rank([self.given, *(k for k in candidates if k != self.given)], promise)
+        best = rank(
+            [self.torque_effects, *(k for k in candidates if k != self.torque_effects)], promise
+        )
         next_sets = [key for key in best if key not in self.hypotheses][:most]
-        next_sets += [key - {effect} for key in best[:SIMPLER] for effect in key - self.given]
+        next_sets += [
+            key - {effect} for key in best[:SIMPLER] for effect in key - self.torque_effects
+        ]
         self.of_sets(next_sets, near.fit)
 
     def fit_without_dropouts(self) -> None:
@@ -268,7 +275,7 @@ class Search:
         best = sorted(self.hypotheses.values(), key=lambda h: -h.score)[:FITTED_AGAIN]
         for hypothesis in best:
             while dropouts := beyond_bounds(hypothesis.fit).union(too_small(hypothesis.fit)):
-                left = set(hypothesis.effects) - dropouts | self.given
+                left = set(hypothesis.effects) - dropouts | self.torque_effects
                 if left == set(hypothesis.effects):
                     break
                 hypothesis = self.of_set(left, hypothesis.fit)
@@ -284,12 +291,12 @@ class Search:
         these alone a real vehicle is as a simulated one is without.
         """
         trims = {e for e in hypothesis.effects if e in TRIMS}
-        return self.of_set(self.given | trims, hypothesis.fit)
+        return self.of_set(self.torque_effects | trims, hypothesis.fit)
 
     def _gust_nats(self, key: frozenset) -> float:
         """Nats by which gusts speak for a set with each effect as it was alone."""
         theta = self.base.fit.theta.copy()
-        for effect in key - self.given:
+        for effect in key - self.torque_effects:
             place = places((effect,))
             theta[place] = self.singles[effect].theta[place]
         return self.evidence.gust_nats(theta)
@@ -307,7 +314,7 @@ class Search:
         all motion.
         """
         sizes = range(LARGEST + 1)
-        every = (self.given.union(s) for n in sizes for s in combinations(self.singles, n))
+        every = (self.torque_effects.union(s) for n in sizes for s in combinations(self.singles, n))
         return [s for s in every if sum(CARDS[e].scales_motion for e in s) <= 1]
 
     @property
@@ -344,7 +351,7 @@ class Search:
 
         torques = self.evidence.torques
         out = {} if torques is None else dict(torques.equivalent)
-        for effect in set(effects) - self.given:
+        for effect in set(effects) - self.torque_effects:
             rest = frozenset(hypothesis.effects) - {effect}
             alike = [
                 next(iter(key - rest))

@@ -176,7 +176,9 @@ class Motion:
     def base(self) -> SetFit:
         """The fit of what other estimators named, and nothing else."""
         return (
-            fit_set(self.replay, in_order(self.replay.told)) if self.replay.told else self.nothing
+            fit_set(self.replay, in_order(self.replay.other_sizes))
+            if self.replay.other_sizes
+            else self.nothing
         )
 
     @cached_property
@@ -189,11 +191,13 @@ class Motion:
         ]
         return fit_singles(self.replay, visible)
 
-    def told(self, effects: Mapping[str, tuple[np.ndarray, np.ndarray]], elsewhere) -> "Motion":
+    def with_sizes(
+        self, effects: Mapping[str, tuple[np.ndarray, np.ndarray]], elsewhere
+    ) -> "Motion":
         """The motion with the mean and covariance of `effects` by other estimators,
         which tell all of `elsewhere`.
         """
-        replay = dataclasses.replace(self.replay, told=dict(effects))
+        replay = dataclasses.replace(self.replay, other_sizes=dict(effects))
         return dataclasses.replace(self, replay=replay, elsewhere=frozenset(elsewhere))
 
 

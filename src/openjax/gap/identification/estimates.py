@@ -41,6 +41,7 @@ ESTIMATED = (
 stands.
 """
 TORQUES = tuple(dict.fromkeys(effect for effect, _ in ESTIMATED))
+GAINS = TORQUES[1:]  # which a replay of the motion doesn't tell: it gives up feedback
 
 
 def of_fit(fit: TorqueFit, vehicle) -> EffectEstimates:

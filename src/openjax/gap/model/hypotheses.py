@@ -228,7 +228,7 @@ def fit_singles(replay: Replay, effects: Sequence[str]) -> dict[str, SetFit]:
 
 def fit_single(replay: Replay, effect: str) -> SetFit:
     """The fit of one effect, alone but for what other estimators told."""
-    return fit_set(replay, in_order((effect, *replay.told)), _best_start(replay, effect))
+    return fit_set(replay, in_order((effect, *replay.other_sizes)), _best_start(replay, effect))
 
 
 def in_order(effects: Collection[str]) -> tuple[str, ...]:
@@ -246,7 +246,7 @@ def _starts(effect: str, replay: Replay) -> np.ndarray:
     at = places((effect,))
     starts[:, at] = [[p.start for p in CARDS[effect].fitted], *CARDS[effect].others]
     starts[:, at] = starts[:, at] * replay.size_factors[at] + (absent - ABSENT)[at]
-    for other, (mean, _) in replay.told.items():
+    for other, (mean, _) in replay.other_sizes.items():
         starts[:, places((other,))] = mean
     return starts
 

@@ -91,11 +91,11 @@ def growths(vehicle) -> Parameters:
 
 
 def prior(
-    effects, absent: Parameters = ABSENT, size_factors: Parameters | None = None, told=None
+    effects, absent: Parameters = ABSENT, size_factors: Parameters | None = None, other_sizes=None
 ) -> tuple[Int[np.ndarray, " own"], Float[np.ndarray, " own"], Float[np.ndarray, "own own"]]:
     """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of
     physics effects, for a vehicle that has `absent` (P,) while nothing acts and sizes
-    that are `size_factors` (P,). `told` {effect: (mean, covariance)}: by other
+    that are `size_factors` (P,). `other_sizes` {effect: (mean, covariance)}: by other
     estimators.
     """
     index = []
@@ -105,8 +105,8 @@ def prior(
         card = CARDS[effect]
         at = places((effect,))
         index += at.tolist()
-        if told and effect in told:
-            mean, covariance = told[effect]
+        if other_sizes and effect in other_sizes:
+            mean, covariance = other_sizes[effect]
         else:
             size = np.ones(len(at)) if size_factors is None else size_factors[at]
             mean = size * np.array([p.mean for p in card.fitted]) + (absent - ABSENT)[at]

@@ -63,7 +63,7 @@ class Replay:
     absent: np.ndarray = field(default_factory=ABSENT.copy)
     mixing: np.ndarray | None = None  # (N, N) of `columns` to independent ones
     # {effect: mean and covariance of its parameters} by other estimators
-    told: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    other_sizes: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
     @property
     def tracks(self) -> tuple[Track, ...]:
@@ -85,7 +85,7 @@ class Replay:
 
     def prior(self, effects: Collection[str]):
         """As `library.prior` has it, of this vehicle and what others told of it."""
-        return prior(effects, self.absent, self.size_factors, self.told)
+        return prior(effects, self.absent, self.size_factors, self.other_sizes)
 
     @cached_property
     def flights(self) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ moments of inertia do, so what thrust the other effects leave is taken off first
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -21,8 +21,7 @@ from openjax.gap.identification.estimates import TORQUES, EffectEstimates, of_fi
 from openjax.gap.identification.quantities import TALKED_OF, Identification
 from openjax.gap.model.library import CARDS, PLACE
 from openjax.gap.model.nuisances import SIZE
-from openjax.gap.posterior import Cause, Explanation, explain
-from openjax.gap.quantities import Estimate
+from openjax.gap.posterior import Cause, Estimate, Explanation, explain
 
 LAG, INERTIA, YAW = TORQUES
 NAMES = ("phase up", "phase down", "delay", "roll gain", "pitch gain", "yaw gain")
@@ -33,7 +32,6 @@ HOVER = 0.62  # of the largest thrust, where the slope of a thrust curve is take
 LEAST_GAIN = 0.03
 ALIKE = np.array([0.0, 0.0, 0.0, 1.0, 1.0, -1.0])
 """What another slope of the thrust does to the gains."""
-SWAP = 3.0  # nats by which two sets must differ to be told apart
 LATE = "late"
 """A delay that is no lag of first order: told as a lag, whose place it takes."""
 DRAWS = np.random.default_rng(0).standard_normal((256, 3))
@@ -42,16 +40,14 @@ DRAWS = np.random.default_rng(0).standard_normal((256, 3))
 @dataclass(frozen=True, eq=False)
 class Torques:
     """What the torques tell: `estimate` of NAMES beside the vehicle that has
-    `assumed` (P,), whose motors' time constants are `lags` (2,), s.
+    `nominal` (P,), whose motors' time constants are `lags` (2,), s.
     """
 
     estimate: Estimate
-    assumed: np.ndarray
+    nominal: np.ndarray
     lags: np.ndarray
     effects: tuple[str, ...] = TORQUES
     """Those that these logs can show at all."""
-    scaled: Collection[str] = field(default=())
-    """Effects named by others that change what thrust a command makes."""
 
     @cached_property
     def explanations(self) -> list[Explanation]:
@@ -64,35 +60,35 @@ class Torques:
         """{effect: probability that it acts at a size that matters}."""
         chance = dict.fromkeys(self.effects, 0.0)
         for explanation in self.explanations:
-            found = {}
+            shares = {}
             for cause, sizes in explanation.sizes.items():
                 effect = LAG if cause == LATE else cause
                 if effect in chance:
                     share = float(np.mean(self._sizes_that_matter(cause, *sizes) > 1.0))
-                    found[effect] = max(found.get(effect, 0.0), share)
-            for effect, share in found.items():
+                    shares[effect] = max(shares.get(effect, 0.0), share)
+            for effect, share in shares.items():
                 chance[effect] += explanation.weight * share
         return chance
 
     @cached_property
-    def named(self) -> tuple[str, ...]:
+    def names(self) -> tuple[str, ...]:
         """The effects that are likelier to act than not."""
         return tuple(e for e in CARDS if self.probability.get(e, 0.0) > 0.5)
 
     @cached_property
-    def hidden(self) -> frozenset[str]:
+    def untestable(self) -> frozenset[str]:
         """Effects whose usual size these torques would not show."""
         precision = np.linalg.inv(self.estimate.covariance)
         shifts = {e: usual_shift(e, self.lags) for e in self.effects}
-        shown = {
+        testable = {
             e for e, q in shifts.items() if 0.5 * q @ precision @ q >= DECISION.standard_errors**2
         }
-        return frozenset(TORQUES) - shown
+        return frozenset(TORQUES) - testable
 
     @cached_property
-    def told(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def parameters(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """{named effect: mean and covariance of its parameters in theta}."""
-        return {effect: self._parameters(effect, self._best) for effect in self.named}
+        return {effect: self._parameters(effect, self._best) for effect in self.names}
 
     @cached_property
     def equivalent(self) -> dict[str, list[str]]:
@@ -102,10 +98,10 @@ class Torques:
         weights = {frozenset(e.sizes): e.weight for e in self.explanations}
         best = self._best.sizes
         out = {}
-        for effect in self.named:
+        for effect in self.names:
             rest = frozenset(cause for cause in best if _effects((cause,)) != {effect})
             rivals = (c.name for c in CAUSES if c.name not in {*best, effect, LATE})
-            least = self._best.weight * np.exp(-SWAP)
+            least = self._best.weight * np.exp(-DECISION.swap)
             alike = [c for c in rivals if weights.get(rest | {c}, 0.0) > least]
             alike += ["command_latency"] * (effect == LAG and LATE in best)
             if alike:
@@ -115,24 +111,24 @@ class Torques:
     @cached_property
     def _best(self) -> Explanation:
         """The likeliest set that holds what is named."""
-        return next(e for e in self.explanations if set(self.named) <= _effects(e.sizes))
+        return next(e for e in self.explanations if set(self.names) <= _effects(e.sizes))
 
-    def given(self, theta: np.ndarray, effects: Collection[str]) -> "Torques":
+    def with_thrust_of(self, theta: np.ndarray, effects: Collection[str]) -> "Torques":
         """The same beside the thrust of parameters theta (P,), of which these `effects`
         were named.
         """
-        scaled = tuple(e for e in effects if CARDS[e].scales_torques or CARDS[e].scales_motion)
-        if not scaled:
+        scaling = tuple(e for e in effects if CARDS[e].scales_torques or CARDS[e].scales_motion)
+        if not scaling:
             return self
-        slope = np.log(_thrust_slope(theta) / _thrust_slope(self.assumed))
+        slope = np.log(_thrust_slope(theta) / _thrust_slope(self.nominal))
         estimate = Estimate(
             NAMES, self.estimate.value + slope * ALIKE, self.estimate.covariance
-        ).doubted(ALIKE[:, None], [SIZE["thrust_slope"]])
+        ).with_doubts(ALIKE[:, None], [SIZE["thrust_slope"]])
         # limits act before the lag: what is cut looks like a slow and weak motor
-        if {"thrust_saturation", "thrust_curve"} & set(scaled):
+        if {"thrust_saturation", "thrust_curve"} & set(scaling):
             sizes = [SIZE["cut_phase"]] * 2 + [0.0] + [SIZE["cut_gain"]] * 3
-            estimate = estimate.doubted(np.eye(len(NAMES)), sizes)
-        return Torques(estimate, self.assumed, self.lags, self.effects, scaled)
+            estimate = estimate.with_doubts(np.eye(len(NAMES)), sizes)
+        return Torques(estimate, self.nominal, self.lags, self.effects)
 
     def _sizes_that_matter(self, cause: str, mean, covariance) -> np.ndarray:
         """(draws,) how large a cause is, in units of what begins to matter."""
@@ -149,12 +145,12 @@ class Torques:
         one, with more phase (draws,) at TALKED_OF.
         """
         lag = _lag(self.lags[way], phase)
-        there = (1.0 + 1j * BAND * self.lags[way]) / (1.0 + 1j * BAND * lag[:, None])
-        return np.abs(there - 1.0).mean(1)
+        ratio = (1.0 + 1j * BAND * self.lags[way]) / (1.0 + 1j * BAND * lag[:, None])
+        return np.abs(ratio - 1.0).mean(1)
 
     def _parameters(self, effect: str, explanation: Explanation):
         """Mean and covariance of an effect's parameters, by a set that holds it."""
-        start = self.assumed[[PLACE[effect, p.name] for p in CARDS[effect].fitted]]
+        start = self.nominal[[PLACE[effect, p.name] for p in CARDS[effect].fitted]]
         spread = np.array([p.spread for p in CARDS[effect].fitted])
         if effect == LAG:
             return self._lag_parameters(start, explanation.sizes)
@@ -167,7 +163,8 @@ class Torques:
 
     def _lag_parameters(self, start: np.ndarray, sizes: dict):
         """The lag's: what a delay does beside it is more of it."""
-        value, covariance = start.copy(), np.eye(2) * 1e-8
+        value = start.copy()
+        covariance = np.eye(2) * 1e-8
         if LAG in sizes:
             mean, spread = sizes[LAG]
             lags = _lag(self.lags, mean)
@@ -232,7 +229,9 @@ def torques_of(
         return Torques(estimate, absent, _lags(absent, vehicle))
     if not identification.trustworthy:
         return None
-    estimate = _usual(_estimate(_damped(identification.estimates, vehicle), absent, vehicle), pwm)
+    estimate = _usual(
+        _estimate(_with_usual_damping(identification.estimates, vehicle), absent, vehicle), pwm
+    )
     return Torques(estimate, absent, _lags(absent, vehicle))
 
 
@@ -253,18 +252,19 @@ def _lag(lags: np.ndarray, phase: np.ndarray) -> np.ndarray:
     return np.tan(np.clip(np.arctan(TURN * lags) + phase, 0.02, 1.54)) / TURN
 
 
-def _estimate(found: EffectEstimates, absent: np.ndarray, vehicle) -> Estimate:
+def _estimate(estimates: EffectEstimates, absent: np.ndarray, vehicle) -> Estimate:
     """The estimates as NAMES, beside what is assumed."""
-    extra, gains = found.value[:2], np.maximum(found.value[2:], LEAST_GAIN)
+    extra = estimates.value[:2]
+    gains = np.maximum(estimates.value[2:], LEAST_GAIN)
     nominal = _lags(np.zeros_like(absent), vehicle)
     lags = np.maximum(nominal + extra, 1e-3)
     phase = np.arctan(TURN * lags) - np.arctan(TURN * _lags(absent, vehicle))
-    delay, delay_error = found.clock
+    delay, delay_error = estimates.clock
     value = np.concatenate([phase, [delay], np.log(gains) - _assumed_gains(absent)])
     slopes = np.concatenate([TURN / (1.0 + (TURN * lags) ** 2), 1.0 / gains])
     covariance = np.zeros((len(NAMES), len(NAMES)))
     rows = [0, 1, 3, 4, 5]
-    covariance[np.ix_(rows, rows)] = found.covariance * np.outer(slopes, slopes)
+    covariance[np.ix_(rows, rows)] = estimates.covariance * np.outer(slopes, slopes)
     covariance[2, 2] = delay_error**2 + SIZE["late_motors"] ** 2
     return Estimate(NAMES, value, covariance)
 
@@ -276,12 +276,12 @@ def _assumed_gains(theta: np.ndarray) -> np.ndarray:
     return np.log([xx / slope, yy / slope, theta[PLACE[YAW, "ratio"]] * slope / zz])
 
 
-def _damped(found: EffectEstimates, vehicle) -> EffectEstimates:
+def _with_usual_damping(estimates: EffectEstimates, vehicle) -> EffectEstimates:
     """The estimates with the damping that rotors usually make: a lag, a gain and a
     damping trade places along a ridge. By how much the fitted damping is off says how
     far the model is, so all errors grow by its ratio (Birge 1932).
     """
-    fit = found.fit
+    fit = estimates.fit
     rows = [6, 7]
     spread = fit.covariance[np.ix_(rows, rows)] + np.eye(2) * SIZE["damping_of_rotors"] ** 2
     gain = np.linalg.solve(spread, fit.covariance[rows]).T
@@ -299,12 +299,12 @@ def _usual(estimate: Estimate, pwm: bool) -> Estimate:
     phase = np.sin(2.0 * np.arctan(TURN * 0.025)) / 2.0
     sizes = [SIZE["spin_up"] * phase, SIZE["spin_down"] * phase, 0.0]
     sizes += [SIZE["inertia"], SIZE["inertia"], SIZE["yaw"]]
-    estimate = estimate.doubted(np.eye(len(NAMES)), sizes)
+    estimate = estimate.with_doubts(np.eye(len(NAMES)), sizes)
     ridge = np.array([phase / 0.025, phase / 0.025, 0.0, -35.0, -35.0, 0.0])
-    estimate = estimate.doubted(
+    estimate = estimate.with_doubts(
         np.stack([ridge, ALIKE], 1), [SIZE["lag_and_gain"], SIZE["duty_slope"] if pwm else 0.0]
     )
-    return estimate.doubted(_columns(5), [SIZE["duty_yaw"] if pwm else 0.0])
+    return estimate.with_doubts(_columns(5), [SIZE["duty_yaw"] if pwm else 0.0])
 
 
 def _thrust_slope(theta: np.ndarray) -> float:
