@@ -72,12 +72,7 @@ def _diagnose(case: Case, without, progress, reference, trims) -> Report:
 
 def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
     """The report that the evidence supports, beside what `trims` say changed."""
-    selection = select(evidence)
-    if (torques := evidence.torques) is not None:
-        beside = torques.with_thrust_of(selection.fit.theta, selection.effects)
-        if beside.names != torques.names:
-            evidence = evidence.with_torques(beside)
-            selection = select(evidence)
+    evidence, selection = agreed(evidence)
     acting = {e: selection.probability(e) for e in selection.effects}
     acting |= {
         e: p
@@ -126,6 +121,20 @@ def _days_in_words(report: Report, of_days: Collection[str], trims: Change | Non
     if trims is None and report.reference and set(report.named) & set(OF_DAYS):
         return " Days alone move trims by 1 to 2.5 % of hover: so small a change may be the day's."
     return ""
+
+
+def agreed(evidence: Evidence) -> tuple[Evidence, Selection]:
+    """The evidence with what the torques tell beside the thrust that the other effects
+    leave, and the selection by it.
+    """
+    selection = select(evidence)
+    if (torques := evidence.torques) is None:
+        return evidence, selection
+    beside = torques.with_thrust_of(selection.fit.theta, selection.effects)
+    if beside.names == torques.names:
+        return evidence, selection
+    evidence = evidence.with_torques(beside)
+    return evidence, select(evidence)
 
 
 def forbidden(theta: np.ndarray, effects: Iterable[str], vehicle) -> set[str]:
