@@ -82,7 +82,7 @@ def serve(
         target=_watch, args=(swarm, board, parent, state), daemon=True, name="watch"
     ).start()
     _pass_on(swarm, ends.contacts, ends.stream)
-    teller = Teller(ends.log)
+    teller = Teller(ends.log, batch=2048)  # 15 ms of three vehicles
     for i, member in enumerate(swarm.members):
         member.tell = functools.partial(_tell, teller, i)
     try:

@@ -41,10 +41,12 @@ class Teller:
 
     Args:
       pipe: nobody is told where there is none.
+      batch: bytes that wait until they are worth a call of the system.
     """
 
-    def __init__(self, pipe: Connection | None):
+    def __init__(self, pipe: Connection | None, batch: int = 0):
         self._pipe = pipe
+        self._batch = batch
         self._backlog = bytearray()
         self._lock = threading.Lock()
         if pipe is not None:
@@ -61,6 +63,8 @@ class Teller:
             return
         with self._lock:
             self._backlog += HEAD.pack(kind, number, len(data)) + data
+            if len(self._backlog) < self._batch:
+                return
             try:
                 while self._backlog:
                     count = os.write(self._pipe.fileno(), self._backlog[:_ATOM])

@@ -15,6 +15,8 @@ MAX_BLOCKS = 16
 """Of a vehicle, as on board."""
 MAX_VARIABLES = 128
 """In all blocks together, as on board."""
+SAME = 1e-6
+"""Moments less apart (s) are one: sums of periods are off by roundings."""
 
 
 @dataclass
@@ -92,10 +94,11 @@ class LogBlocks:
         """The log packets due at `time`, stamped with it in milliseconds."""
         packets = []
         for ident, block in self._blocks.items():
-            if block.period <= 0 or time < block.due:
+            if block.period <= 0 or time + SAME < block.due:
                 continue
             # in step with its start; what came due in between is left out
-            block.due += block.period * (1 + int((time - block.due) / block.period))
+            late = max(time - block.due, 0.0)
+            block.due += block.period * (1 + int(late / block.period))
             stamp = struct.pack("<I", int(time * 1000) & 0xFFFFFF)[:3]
             values = b"".join(
                 pack_number(fmt, LOG_VARIABLES[name][1](firmware, sensors))

@@ -1,5 +1,6 @@
 """Virtual Crazyflies in real time: links, firmware and vehicles of one process."""
 
+import math
 import select
 import time
 from collections.abc import Callable
@@ -9,6 +10,7 @@ import numpy as np
 from openjax.flying.endpoints import UDP_PORT
 from openjax.virtual_crazyflie.firmware import STEP, VirtualFirmware
 from openjax.virtual_crazyflie.link import LinkFaults, VirtualLink
+from openjax.virtual_crazyflie.logs import SAME
 from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 
 LONGEST_WAIT = 0.02
@@ -68,6 +70,9 @@ class VirtualCrazyflies:
                 *(firmware.logs.next() for firmware in self.firmware),
                 self.time + LONGEST_WAIT,
             )
+            # nothing happens between two steps: who looked again and again would take a
+            # core, and the real-time scheduler then stops it for 50 ms in each second
+            due = STEP * math.ceil(due / STEP - 1e-6)
             wait = due - (time.perf_counter() - start)
             if wait > 0:
                 select.select(sockets, [], [], wait)
@@ -89,7 +94,7 @@ class VirtualCrazyflies:
                 self.links[i].send(answer, until, peer)
         self._advance(until)
         for i, (firmware, link) in enumerate(zip(self.firmware, self.links, strict=True)):
-            if firmware.logs.next() <= self.time:
+            if firmware.logs.next() <= self.time + SAME:
                 for packet in firmware.logs.packets(firmware, self.time, self.vehicles.sensors(i)):
                     link.send(packet, until)
             link.flush(until)

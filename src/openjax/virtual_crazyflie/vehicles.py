@@ -118,6 +118,9 @@ class VirtualVehicles:
         self.report = Report._make(np.asarray(leaf, np.float64) for leaf in report)
         share = self.report.motor_command.mean(1) / self._hover
         self.battery = np.maximum(self.battery - steps * STEP * share / self._endurance, 0.0)
+        # once for all packets of a moment
+        load = SAG * self.report.motor_command.mean(1)
+        self._voltage = FULL_VOLTAGE - SPENT * (1.0 - self.battery) - load
         return self.report
 
     def _program(self, flat, set_points, steps):
@@ -162,7 +165,7 @@ class VirtualVehicles:
 
     def voltage(self) -> np.ndarray:
         """(N,) V, of the batteries under their loads."""
-        return FULL_VOLTAGE - SPENT * (1.0 - self.battery) - SAG * self.report.motor_command.mean(1)
+        return self._voltage
 
     def sensors(self, i: int) -> Sensors:
         """What vehicle i senses."""
