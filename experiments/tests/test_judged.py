@@ -51,11 +51,21 @@ def test_the_verdict_is_the_evader_that_is_caught_least():
 def test_a_slower_vehicle_has_rows_of_its_own():
     slower = {"records": RECORDS, "effects": load_effects(SLOWER)[1], "vehicle": "crazyflie"}
     assert vehicle_of(slower) == "slower" and vehicle_of({"records": RECORDS}) == "nominal"
-    learned, planner, paper = rows_of("evaders", slower)
+    learned, *_ = rows_of("evaders", slower)
     assert learned["capture_rate"]["random"] == 0.5
-    before = {**paper, "policy": "before"}
-    told = page({"rows": [learned, planner, paper, before]}).rows()
-    assert len(told) == 2 + 3 and "slower vehicle" in told[2]
+
+
+def test_the_page_shows_a_short_and_the_whole_budget_of_weights_and_the_planner():
+    learned, planner, _ = rows_of("evaders", {"records": RECORDS})
+    slower = {**planner, "vehicle": "slower"}
+    spent = [{**learned, "steps": million * 1e6} for million in (100, 250, 420)]
+    curves = {"evaders, nominal": spent, "evaders, slower": spent, "tried: more, nominal": spent}
+    told = page({"rows": [learned, planner, slower], "curves": curves}).parts.records
+    assert [row["judge"] for row in told] == [
+        "learners, 250 M steps",
+        "learners, 420 M steps",
+        "a planner",
+    ]
 
 
 def test_the_second_judge_is_the_least_over_learners_and_planner():

@@ -16,11 +16,11 @@ import pytest
 from openjax.commands.export import EACH, Arguments, export, observations
 from openjax.errors import UserError
 from openjax.export.c_compiled import compile_c
-from openjax.export.c_program import Draws, c_program
+from openjax.export.c_program import DrawnStrategies, c_program
 from openjax.learning import TrainSettings
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Observation, Pursuit, PursuitSettings
-from openjax.store.mixed_policies import mixed_policy
+from openjax.store.mixed_policies import Draws, mixed_policy
 from openjax.store.policies import abstract_parameters, load_policy
 from openjax.store.policy_files import save_policy_file
 
@@ -114,7 +114,7 @@ def mixed_file(policy_file):
     """A team that draws one of two policies every 0.4 s."""
     member = load_policy(str(policy_file))
     scale = jax.tree.map(lambda leaf: 0.5 * leaf, member.parameters)
-    both = mixed_policy([member, dataclasses.replace(member, parameters=scale)], 0.4)
+    both = mixed_policy([member, dataclasses.replace(member, parameters=scale)], Draws(0.4))
     path = policy_file.with_name("mixed.npz")
     save_policy_file(path, both.parameters, both.settings, storage="float32")
     return path
@@ -136,7 +136,8 @@ def test_who_draws_a_strategy_is_said(mixed_file, flown, tmp_path, monkeypatch, 
 
 
 @NEEDS_CC
-def test_the_c_program_draws_with_equal_odds_and_the_same_again():
+@pytest.mark.parametrize("odds", [(), (1.0, 3.0, 2.0)])
+def test_the_c_program_draws_by_the_odds_and_the_same_again(odds):
     kinds = {
         "x": jax.ShapeDtypeStruct((2,), jnp.float32),
         "strategy": jax.ShapeDtypeStruct((), jnp.int32),
@@ -146,7 +147,7 @@ def test_the_c_program_draws_with_equal_odds_and_the_same_again():
         kinds,
         "draw",
         "A test",
-        Draws(3, 40, 0.4),
+        DrawnStrategies(3, 40, 0.4, odds),
     )
     compiled = compile_c(program, "draw")
     pointer = ctypes.byref(compiled.observation)
@@ -162,11 +163,13 @@ def test_the_c_program_draws_with_equal_odds_and_the_same_again():
         return out
 
     games = np.array([draws(seed, range(0, 40 * 30, 40)) for seed in range(100)])
-    # 3,000 draws: five standard deviations of a third of them are 130
-    assert (np.abs(np.bincount(games.ravel(), minlength=3) - 1000) < 130).all()
+    expected = 3000 * np.array(odds or (1.0, 1.0, 1.0)) / sum(odds or (1.0, 1.0, 1.0))
+    drawn = np.bincount(games.ravel(), minlength=3)
+    assert (np.abs(drawn - expected) < 5 * np.sqrt(expected)).all()
     # nor does one draw tell the next
     following = np.bincount((3 * games[:, :-1] + games[:, 1:]).ravel(), minlength=9)
-    assert (np.abs(following - 2900 / 9) < 5 * np.sqrt(2900 / 9)).all()
+    expected = 2900 * np.outer(expected, expected).ravel() / 3000**2
+    assert (np.abs(following - expected) < 5 * np.sqrt(expected)).all()
     assert draws(7, range(0, 1200, 40)) == draws(7, range(39, 1239, 40)) == games[7].tolist()
 
 

@@ -5,6 +5,7 @@ do.
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from openjax import load_policy
@@ -12,6 +13,7 @@ from openjax.flying.controller import Pose
 from openjax.flying.game import Game, game_functions, pose_array
 from openjax.flying.real_time import compile_in_line
 from openjax.pursuit import find_scenario, scenario_task
+from openjax.pursuit.teams import strategy_of
 
 
 def test_the_packed_tick_plays_as_the_games_own_functions():
@@ -57,11 +59,10 @@ def test_what_a_team_draws_is_told():
     task = scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario)
     game = Game(policy, task)
     poses = [Pose(0.0, (0.3 * i, 0.0, 0.5), (0.0,) * 3, (1.0, 0.0, 0.0, 0.0)) for i in range(3)]
-    drawn = [game.start(poses).strategies for _ in range(4)]
+    drawn = [game.start(poses).draws for _ in range(4)]
     assert len(drawn[0]) == -(-settings.episode_length // settings.strategy_steps)
-    assert len(set(drawn)) > 1 and {n for draws in drawn for n in draws} == set(
-        range(settings.strategies)
-    )
+    meant = strategy_of(settings, jnp.array(drawn), jnp.ones(np.shape(drawn), bool))
+    assert len(set(drawn)) > 1 and set(np.unique(meant).tolist()) == set(range(settings.strategies))
 
 
 def test_a_compiler_without_the_option_compiles_as_it_does():

@@ -16,6 +16,7 @@ BOTH = ("command_latency", "packet_loss")
 CASE = SimpleNamespace(
     vehicle_file=SimpleNamespace(motor=SimpleNamespace(command="thrust"), log={}),
     others=lambda flight: (),
+    vehicle_of=lambda flight: None,
 )
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from openjax.errors import UserError
 from openjax.pursuit import (
     SCENARIOS,
     Pursuit,
@@ -48,7 +49,7 @@ def test_compiled_and_mapped_is_the_same_as_eager_one_by_one(tiny):
 
 
 def test_arrays_of_another_shape_are_refused_while_tracing(tiny):
-    with pytest.raises(AssertionError, match="shape"):
+    with pytest.raises(UserError, match=r"\(2, 4\), but 3 pursuers take \(3, 4\)"):
         jax.eval_shape(tiny.step, KEY, jax.eval_shape(tiny.reset, KEY)[1], jnp.zeros((2, 4)))
     task = scenario_task(TINY, SCENARIOS["wall"])
     with pytest.raises(AssertionError, match="shape"):

@@ -127,7 +127,7 @@ def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None
     def act(**fields):
         return policy(Observation(**fields))
 
-    draws = _draws(policy.settings.environment)
+    draws = _draws(policy)
     files, actions, extra = write(act, inputs, samples, (policy.source, draws))
     report = {
         "policy": policy.source,
@@ -147,14 +147,23 @@ def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None
     return report
 
 
-def _draws(settings):
-    """How the policy's team draws its strategies; None where it has one."""
-    from openjax.export.c_program import Draws
+def _draws(policy):
+    """How the policy's team draws its strategies; None where it has one. Raises
+    UserError where that depends on what it sees.
+    """
+    from openjax.export.c_program import DrawnStrategies
 
+    settings = policy.settings.environment
     if settings.strategies == 1:
         return None
+    if settings.strategy_odds_unseen:
+        raise UserError(
+            f"policy {policy.source} draws by other odds while nobody sees the evader, which an "
+            "exported one can't; mix it without --odds_unseen"
+        )
     steps = min(settings.strategy_steps, settings.episode_length)
-    return Draws(settings.strategies, steps, round(steps * settings.time_step, 6))
+    seconds = round(steps * settings.time_step, 6)
+    return DrawnStrategies(settings.strategies, steps, seconds, settings.strategy_odds)
 
 
 def _describe_draws(draws) -> dict:

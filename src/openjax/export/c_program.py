@@ -5,6 +5,7 @@ The function is traced and what doesn't depend on its inputs is computed, as for
 Intermediate arrays share one workspace, which the caller provides.
 """
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,24 +28,45 @@ _TEMPLATES = jinja2.Environment(
 _TEMPLATES.filters |= {"dims": dims, "number_rows": number_rows, "product": math.prod}
 
 
-class Draws(NamedTuple):
+class DrawnStrategies(NamedTuple):
     """How a team draws which of its strategies it flies."""
 
     strategies: int
-    """As many; each is drawn with equal odds."""
+    """As many."""
     steps: int
     """Control steps between two draws."""
     seconds: float
     """s between two draws."""
+    odds: tuple[float, ...] = ()
+    """Of each, in any unit; empty: all have the same."""
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """The probability of each; they add up to 1."""
+        odds = self.odds or (1.0,) * self.strategies
+        return tuple(one / sum(odds) for one in odds)
+
+    @property
+    def below(self) -> tuple[int, ...]:
+        """A draw of 32 bits below the first number means strategy 0, below the second
+        strategy 1, and so on.
+        """
+        ends = itertools.accumulate(self.shares[:-1])
+        return tuple(min(int(end * 2**32), 2**32 - 1) for end in ends)
 
     def in_words(self) -> str:
         """What whoever runs an exported policy has to do."""
         return (
             f"strategy is drawn by the program that calls the policy: a whole number from 0 to "
-            f"{self.strategies - 1}, with equal odds, when a game begins and every "
+            f"{self.strategies - 1}, {self._odds_in_words()}, when a game begins and every "
             f"{self.steps} control steps ({self.seconds:g} s); all pursuers of a team take the "
             "same one. A team that always flies one strategy is beaten far more often"
         )
+
+    def _odds_in_words(self) -> str:
+        if len(set(self.shares)) == 1:
+            return "with equal odds"
+        return "with probabilities " + ", ".join(f"{share:.3g}" for share in self.shares)
 
 
 @dataclass
@@ -93,7 +115,7 @@ def c_program(
     inputs: dict[str, jax.ShapeDtypeStruct],
     prefix: str,
     about: str,
-    draws: Draws | None = None,
+    draws: DrawnStrategies | None = None,
 ) -> CProgram:
     """A C program of `function(**inputs)`, which returns one array, `action`; inputs
     that it doesn't read are left out.

@@ -25,7 +25,7 @@ class GameNotes:
     end: str = ""
     over_speed: int = 0
     """Steps in which a pursuer was faster than the game allows."""
-    strategies: tuple[int, ...] = ()
+    draws: tuple[float, ...] = ()
     """What the team drew for it, see `openjax.flying.game.Play`."""
 
     def count(self, play, is_too_fast: bool) -> None:
@@ -87,9 +87,9 @@ class FlightRecord:
         """Add rows that another record told."""
         self._rows.frombytes(rows)
 
-    def begin_game(self, strategies: tuple[int, ...] = ()) -> int:
+    def begin_game(self, draws: tuple[float, ...] = ()) -> int:
         """The number of a game that begins now, in which a team flies what it drew."""
-        self.games.append(GameNotes(strategies=strategies))
+        self.games.append(GameNotes(draws=draws))
         return self._hand_on()
 
     def count(self, play, is_too_fast: bool) -> None:

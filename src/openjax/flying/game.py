@@ -29,9 +29,10 @@ class Play(NamedTuple):
     over: bool
     breaches: np.ndarray  # (N,)
     crashed: np.ndarray  # (N,)
-    strategies: tuple[int, ...] = ()
-    """At the start of an episode: which of its strategies the team flies, one after
-    another; empty where it has one.
+    draws: tuple[float, ...] = ()
+    """At the start of an episode: from 0 to 1, by which the team chooses the strategies
+    that it flies one after another (`openjax.pursuit.teams.strategy_of`); empty where it
+    has one.
     """
 
 
@@ -120,7 +121,7 @@ class Game:
         # again
         def begin(poses, seed):
             state, action = first(task, poses, seed)
-            none = np.zeros(0, np.int32)
+            none = np.zeros(0, np.float32)
             draws = none if state.strategies is None else state.strategies
             return ravel_pytree((state, action))[0], action, draws
 
@@ -151,7 +152,7 @@ class Game:
             over=False,
             breaches=np.zeros(n),
             crashed=np.zeros(n, bool),
-            strategies=tuple(np.asarray(draws).tolist()),
+            draws=tuple(round(float(draw), 4) for draw in np.asarray(draws)),
         )
 
     def step(self, poses: list[Pose], evader: np.ndarray | None = None) -> Play:

@@ -177,7 +177,7 @@ class Flight:
         poses = [drone.estimate for drone in self.state.drones]
         if first:
             self._play = self.game.start(poses[: self._pursuers])
-            self._episode = self.record.begin_game(self._play.strategies)
+            self._episode = self.record.begin_game(self._play.draws)
             self._begun = time
         else:
             evader = np.array(poses[-1].position) if self._evader_flies else None
