@@ -7,7 +7,7 @@ is no longer over. `python -m tests.test_house` writes the list.
 
 import ast
 import functools
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -158,6 +158,20 @@ def test_functions_do_one_thing():
     assert not listed - over, "no longer over: take them off the list (python -m tests.test_house)"
     for limit, most in OVER.items():
         assert sum(limit in line.rpartition(":")[2] for line in listed) <= most, limit
+
+
+def test_a_module_defines_each_name_once():
+    twice = {
+        f"{path.relative_to(ROOT)} {name}"
+        for path in modules().values()
+        for name, number in Counter(
+            node.name
+            for node in parsed(path).body
+            if isinstance(node, ast.FunctionDef | ast.ClassDef)
+        ).items()
+        if number > 1
+    }
+    assert not twice, "the last one counts, whichever was meant"
 
 
 def test_rooms_import_downwards_only():

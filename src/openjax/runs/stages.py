@@ -185,52 +185,6 @@ def _metrics(run, state):
     return MetricsWriter(run.directory.path, continuation, on_record=run.job.own_parts.on_record)
 
 
-def _plan(run, state):
-    """What is left to do from now on."""
-    settings = run.job.settings
-    return Plan(
-        total_updates=settings.total_updates,
-        steps_per_update=settings.steps_per_update,
-        validation_interval=settings.validation_interval,
-        time_limit=min(state.deadline - time.monotonic(), run.job.time_limit),
-        validate_start=state.is_due,
-    )
-
-
-def _metrics(run, state):
-    """What writes metrics: afresh, or on from where a checkpoint was."""
-    go_on = {}
-    if state.is_restored:
-        go_on = {
-            "resumed_update": state.update,
-            "resumed_steps": state.update * run.job.settings.steps_per_update,
-            "drop_validation": state.is_due,
-        }
-    return MetricsWriter(run.directory.path, on_record=run.job.own_parts.on_record, **go_on)
-
-
-def _plan(run, state):
-    """What is left to do from now on."""
-    settings = run.job.settings
-    return Plan(
-        total_updates=settings.total_updates,
-        steps_per_update=settings.steps_per_update,
-        validation_interval=settings.validation_interval,
-        time_limit=min(state.deadline - time.monotonic(), run.job.time_limit),
-        validate_start=state.is_due,
-    )
-
-
-def _metrics(run, state):
-    """What writes metrics: afresh, or on from where a checkpoint was."""
-    if not state.is_restored:
-        return MetricsWriter(run.directory.path)
-    steps = state.update * run.job.settings.steps_per_update
-    return MetricsWriter(
-        run.directory.path, state.update, resumed_steps=steps, drop_validation=state.is_due
-    )
-
-
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
     """Score and metrics of a carry on the validation tasks; the same in all processes."""
