@@ -4,6 +4,7 @@ is an error.
 
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import openjax
@@ -46,21 +47,31 @@ html_extra_path = [
 ]  # a replay of six layouts: `openjax view --scenario all --seed 3 --html FILE`
 
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))  # programs beside the pages
 # a copy of the pages of results, so that links lead to them
 RESULTS = HERE / "measured"
 TO_RESULTS = re.compile(r"\]\((?:\.\./)*experiments/results/")
 TO_PAGES = re.compile(r"\]\((?:\.\./)*docs/")
+# the site's page of the effects is made here; on GitHub the links lead to their files
+EFFECTS = HERE / "generated" / "effects.md"
+TO_EFFECTS = re.compile(r"\]\((?:\.\./)+src/openjax/vehicle/effects\)")
 
 
 def setup(app):
-    """Bring the pages of results in, and let links that lead there from outside lead
-    into the site.
+    """Bring in the pages of results and make that of the effects. Links that lead there
+    from outside lead into the site.
     """
+    from make_effects import page
+
     shutil.rmtree(RESULTS, ignore_errors=True)
     shutil.copytree(HERE.parent / "experiments" / "results", RESULTS)
+    EFFECTS.parent.mkdir(exist_ok=True)
+    EFFECTS.write_text(page(), encoding="utf-8")
     app.connect("source-read", lambda app, name, source: _lead_inside(source))
     app.connect("include-read", lambda app, path, name, source: _lead_inside(source))
 
 
 def _lead_inside(source):
-    source[0] = TO_PAGES.sub("](/", TO_RESULTS.sub("](/measured/", source[0]))
+    text = TO_RESULTS.sub("](/measured/", source[0])
+    text = TO_EFFECTS.sub("](/generated/effects.md)", text)
+    source[0] = TO_PAGES.sub("](/", text)

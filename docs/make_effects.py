@@ -1,5 +1,5 @@
-"""The page of the effects and its pictures, from the effects' own code: `python
-docs/make_effects.py`.
+"""Pictures of the effects from their own code, `python docs/make_effects.py`, and the
+text of their page, which the site's build writes.
 
 Each kind of hook has its picture: what becomes of a command, of a pose, of a motor
 command, of a rotor's thrust, of the wrench, or of a manoeuvre where the vehicle itself
@@ -247,7 +247,7 @@ def page() -> str:
         module = __import__(f"openjax.vehicle.effects.{name}", fromlist=["EFFECT"])
         sentence = " ".join(module.__doc__.split("\n\n")[0].split())
         lines += ["", f"## {name}", "", sentence, "", f"$${effect.formula}$$", ""]
-        lines += [f"![{name}](pictures/effects/{name}.png)", ""]
+        lines += [f"![{name}](../pictures/effects/{name}.png)", ""]
         for parameter, what in effect.parameters.items():
             meaning = f" ({what.meaning})" if what.meaning else ""
             unit = "" if what.unit == "1" else f" {what.unit}"
@@ -258,11 +258,10 @@ def page() -> str:
 
 
 def main() -> None:
-    """Write the page and all pictures."""
+    """Draw all pictures."""
     PICTURES.mkdir(parents=True, exist_ok=True)
     for name, effect in EFFECTS.items():
         draw(effect, PICTURES / f"{name}.png")
-    (DOCS / "effects.md").write_text(page(), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ OTHER_RECIPE = "isn't the preset's recipe of today"
 """What a model card says of weights that the preset wouldn't make again."""
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 # folders that building the site leaves
-MADE = ("_build", "jupyter_execute", "measured")
+MADE = ("_build", "generated", "jupyter_execute", "measured")
 PAGES = [path for path in sorted((ROOT / "docs").rglob("*.md")) if not set(MADE) & set(path.parts)]
 
 
