@@ -67,6 +67,11 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+def linked(words: str, page: str) -> str:
+    """Words that lead to a page of results."""
+    return f"[{words}](experiments/results/{page}.md)"
+
+
 def judged() -> str:
     """The default policy against each kind of evader, by layout."""
     rows = []
@@ -124,14 +129,12 @@ def paper_game() -> tuple[list[str], list[str]]:
     steps = np.mean([mean(layout, "capture_step") for layout in shared])
     paper = np.mean([means(layout, "OPEN")[1] for layout in shared])
     captures = min(mean(layout, "capture_rate") for layout in SCENARIOS)
-    page = "[layouts](experiments/results/headline.md)"
-    game = "The paper's game, three seeds of `open`"
+    game = linked("The paper's game, three seeds of `open`", "headline")
     return (
-        [f"{game}, worst of six unseen layouts: capture rate", f"{captures:.2f}", page],
+        [f"{game}: captures, worst of six unseen layouts", f"{captures:.2f}"],
         [
-            f"{game}, the paper's {len(shared)} layouts: mean steps to capture",
+            f"{game}: mean steps to a capture, the paper's {len(shared)} layouts",
             f"{steps:.0f} (paper: {paper:.0f})",
-            page,
         ],
     )
 
@@ -141,8 +144,8 @@ def whole_runs() -> list[str]:
     runs = [run for run in read("seconds")["runs"] if run.get("whole") and run["kept"] == "nothing"]
     seconds = [run["whole"]["seconds"] for run in runs]
     assert len(seconds) == 5
-    told = "Training on one H100, preset `paper`, nothing compiled before: slowest of five runs"
-    return [told, f"{max(seconds):.0f} s", "[seconds](experiments/results/seconds.md)"]
+    told = linked("Training on one H100", "seconds")
+    return [f"{told}, nothing compiled before: slowest of five runs", f"{max(seconds):.0f} s"]
 
 
 def first_runs() -> list[str]:
@@ -150,9 +153,9 @@ def first_runs() -> list[str]:
     runs = [run for run in read("quick")["runs"] if "recipe" not in run]
     assert (len(runs), len({run["seed"] for run in runs})) == (10, 5)
     records = [row for run in runs for row in run["after"] if row["scenario"] in SCENARIOS]
-    told = "Training on two CPU cores, preset `quick`: worst layout of ten runs, capture rate"
+    told = linked("Training on two CPU cores", "quick")
     least = min(row["capture_rate"] for row in records)
-    return [told, f"{least:.2f}", "[quick](experiments/results/quick.md)"]
+    return [f"{told}, preset `quick`: captures, worst layout of ten runs", f"{least:.2f}"]
 
 
 def judged_rows() -> list[list[str]]:
@@ -160,10 +163,9 @@ def judged_rows() -> list[list[str]]:
     rows = []
     for judge in (LEARNED, PLANNER):
         rate = rates(DEFAULT_POLICY, judge)
-        told = f"`{DEFAULT_POLICY}` against {JUDGES[judge]}"
+        told = linked(f"`{DEFAULT_POLICY}` against {JUDGES[judge]}", "judged")
         for place, value in (("worst layout", worst(rate)), ("uniform tasks", rate["uniform"])):
-            page = "[judged](experiments/results/judged.md)"
-            rows.append([f"{told}, {place}: capture rate", f"{value:.2f}", page])
+            rows.append([f"{told}: captures, {place}", f"{value:.2f}"])
     return rows
 
 
@@ -171,8 +173,8 @@ def slower_vehicle() -> list[str]:
     """Mean crash rate of `flight` over the six layouts."""
     layouts = read("vehicles")["policies"]["flight"]["table"]
     crashes = np.mean([layouts[name]["crash_rate"] for name in SCENARIOS])
-    told = "`flight` on a slower Crazyflie, without the speed clamp: crash rate"
-    return [told, f"{crashes:.3f}", "[vehicles](experiments/results/vehicles.md)"]
+    told = linked("`flight` on a slower Crazyflie", "vehicles")
+    return [f"{told}, without the speed clamp: crashes", f"{crashes:.3f}"]
 
 
 def forced() -> list[str]:
@@ -185,25 +187,21 @@ def forced() -> list[str]:
         if square["speed_ratio"] < square["forced_below"] and square["capture_radius"] >= 0.2
         if "learned" in square
     ]
-    told = "`teams` where points can force a capture, reach 0.2 m or more: capture rate"
-    return [told, f"{np.mean(squares):.2f}", "[map](experiments/results/catch_map.md)"]
+    told = linked("`teams` where points can force a capture", "catch_map")
+    return [f"{told}, reach 0.2 m or more: captures", f"{np.mean(squares):.2f}"]
 
 
 def diagnosis() -> list[str]:
     """The last three sealed seeds, without a reference, each answered once."""
     first = read("exam_reference")["sealed_2309_to_2311"]["figures"]["alone"]["first"]
-    told = f"Diagnosis of {first['n']} simulated cases with one cause: right cause first"
-    return [
-        told,
-        f"{first['hits'] / first['n']:.2f}",
-        "[exam](experiments/results/exam_reference.md)",
-    ]
+    told = linked(f"Diagnosis of {first['n']} simulated cases with one cause", "exam_reference")
+    return [f"{told}: right cause first", f"{first['hits'] / first['n']:.2f}"]
 
 
 def results() -> str:
     """The README's table."""
     rows = [whole_runs(), first_runs(), *paper_game(), *judged_rows(), slower_vehicle(), forced()]
-    return table(["What was measured", "Result", "Details"], [*rows, diagnosis()])
+    return table(["What was measured", "Result"], [*rows, diagnosis()])
 
 
 def game() -> str:
