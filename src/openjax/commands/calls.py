@@ -162,5 +162,5 @@ def evaluate(
         opponent=str(opponent) if isinstance(opponent, Path) else opponent,
         environment=changed(policy.settings.environment, **changes),
     )
-    records, _ = fly_scenarios(command, policy, {})
+    records = [kind.record() for kind in fly_scenarios(command, policy, {})]
     return records if scenario == "all" else records[0]

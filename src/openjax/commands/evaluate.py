@@ -24,6 +24,7 @@ from openjax.store import default_policy
 from openjax.store.compiled_programs import cache_programs
 
 if TYPE_CHECKING:
+    from openjax.evaluation.evaluator import Flown
     from openjax.store.policies import LoadedPolicy
 
 PROGRAM = "openjax evaluate"
@@ -133,8 +134,8 @@ def main(arguments: Sequence[str]) -> int:
     evaluators = {}
     results = []
     for options, policy in prepare(command, arguments):
-        records, _ = fly_scenarios(options, policy, evaluators)
-        results.append((options, policy.source, records))
+        flown = fly_scenarios(options, policy, evaluators)
+        results.append((options, policy.source, [kind.record() for kind in flown]))
     _show(command, results)
     return 0
 
@@ -158,9 +159,8 @@ def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
     return policies
 
 
-def fly_scenarios(command: EvaluateCommand, policy, evaluators: dict) -> tuple[list[dict], list]:
-    """A record (see `openjax.evaluation.evaluator.FIELDS`) and the first episode's
-    `Trajectory` per scenario.
+def fly_scenarios(command: EvaluateCommand, policy, evaluators: dict) -> list["Flown"]:
+    """The episodes of each scenario.
 
     Args:
       command: what to fly, with the game's settings.
@@ -202,12 +202,7 @@ def fly_scenarios(command: EvaluateCommand, policy, evaluators: dict) -> tuple[l
         def tell(layout):
             steps.begin(layout, "compiled first" if not is_compiled and layout == first else "")
 
-        episodes = evaluators[kind].fly(
-            policy.parameters, tasks, jax.random.key(command.seed), tell
-        )
-        return [kind.record() for kind in episodes], [
-            kind.trajectory(0, kind.name) for kind in episodes
-        ]
+        return evaluators[kind].fly(policy.parameters, tasks, jax.random.key(command.seed), tell)
 
 
 def _settings(command):

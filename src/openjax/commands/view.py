@@ -130,8 +130,8 @@ def fly_all(command: ViewCommand) -> list[tuple[str, Trajectory]]:
     for policy in command.start():
         # each policy flies the game that it was trained in
         evaluation = EvaluateCommand(**options, episodes=1, environment=policy.settings.environment)
-        _, episodes = fly_scenarios(evaluation, policy, evaluators)
-        flights += [(policy.source, episode) for episode in episodes]
+        flown = fly_scenarios(evaluation, policy, evaluators)
+        flights += [(policy.source, kind.trajectory(0, kind.name)) for kind in flown]
     return flights
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from openjax.evaluation.message_settings import MessageSettings
@@ -152,26 +153,27 @@ def summarise(evaluation: Evaluation) -> dict[str, float]:
     """Captures, breaches, crashes and errors as means over the episodes, capture steps
     of the slowest hundredth too.
     """
-    statistics = evaluation.statistics
+    # on the host: on a device, each of these few numbers is a program of its own
+    statistics = jax.tree.map(np.asarray, evaluation.statistics)
     hundredth = max(1, len(statistics.capture_step) // 100)
-    slowest = jnp.sort(statistics.capture_step)[-hundredth:]
-    steps = jnp.maximum(statistics.steps, 1)
+    slowest = np.sort(statistics.capture_step)[-hundredth:]
+    steps = np.maximum(statistics.steps, 1)
 
     def mean(x):
-        return float(jnp.mean(jnp.asarray(x, jnp.float32)))
+        return float(np.mean(np.asarray(x, np.float32)))
 
     return {
         "capture_rate": mean(statistics.captured),
         "capture_step": mean(statistics.capture_step),
         "slowest_capture_step": mean(slowest),
-        "collision_rate": mean(statistics.collision_rate),
+        "collision_rate": mean(statistics.collision_steps / steps),
         "collision_parts": {
             "pillar": mean(statistics.pillar_steps / steps),
             "drone": mean(statistics.drone_steps / steps),
             "bounds": mean(statistics.bounds_steps / steps),
         },
         "crash_rate": mean(statistics.crashed),
-        "over_speed_rate": mean(statistics.over_speed_rate),
+        "over_speed_rate": mean(statistics.over_speed_steps / steps),
         "prediction_error": mean(evaluation.prediction_error),
         "last_seen_error": mean(evaluation.last_seen_error),
         "episode_return": mean(statistics.episode_return),

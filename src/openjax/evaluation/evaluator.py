@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from openjax.background import compile_ahead
+from openjax.background import compile_ahead, side_by_side
 from openjax.evaluation.episodes import Evaluation, make_evaluate, summarise
 from openjax.evaluation.message_settings import MessageSettings
 from openjax.evaluation.result_tables import record_of
@@ -55,18 +55,24 @@ class Evaluator:
         """One episode per task; `kinds` are tasks by name, each with a leading axis of
         its own.
 
-        Kinds that fill whole batches are flown one by one (`tell` hears which), so that
-        a kind's result is the same alone and among others; else all are packed into as
-        few batches as they need.
+        Kinds that fill whole batches are flown each by itself (`tell` hears which), so
+        that a kind's result is the same alone and among others; else all are packed into
+        as few batches as they need.
         """
         numbers = [tasks.evader_position.shape[0] for tasks in kinds.values()]
         if not any(number % self.batch for number in numbers):
-            results = []
-            for name, tasks in kinds.items():
+
+            def fly_kind(item):
+                name, tasks = item
                 tell(name)
                 evaluation, records = self._fly(parameters, tasks, key)
-                results.append(Flown(self, name, tasks, evaluation, records))
-            return results
+                return Flown(self, name, tasks, evaluation, records)
+
+            if jax.default_backend() != "cpu":
+                return [fly_kind(item) for item in kinds.items()]
+            # a processor flies a batch with one of its cores; both would compile it
+            self.compile_ahead(parameters, next(iter(kinds.values())))()
+            return side_by_side(fly_kind, kinds.items())
         one_stack, part = stack(kinds)
         evaluation, records = self._fly(parameters, one_stack, key)
         parts = part(evaluation)
@@ -81,6 +87,8 @@ class Evaluator:
         batch.
         """
         number = tasks.evader_position.shape[0]
+        # indexed here: on a device, each array's shape compiles another program
+        tasks = jax.tree.map(np.asarray, tasks)
         evaluations = []
         records = []
         for i, start in enumerate(range(0, number, self.batch)):
@@ -184,7 +192,7 @@ def layout_slots(settings: PursuitSettings) -> int:
 
 def repeat_task(task: Task, number: int) -> Task:
     """`number` copies along a new leading axis."""
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number, *leaf.shape)), task)
+    return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (number, *leaf.shape)), task)
 
 
 def stack(kinds: Mapping[str, Task]) -> tuple[Task, Callable[[Any], dict[str, Any]]]:

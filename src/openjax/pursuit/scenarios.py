@@ -107,7 +107,7 @@ def scenario_task(settings: PursuitSettings, scenario: Scenario) -> Task:
         pursuer_position=jnp.asarray(scenario.pursuers, jnp.float32),
         evader_position=jnp.asarray(scenario.evader, jnp.float32),
         pillar_position=jnp.asarray(pillars),
-        pillar_active=jnp.arange(slots) < pillar_number,
+        pillar_active=jnp.asarray(np.arange(slots) < pillar_number),
     )
 
 
