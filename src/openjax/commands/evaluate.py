@@ -134,8 +134,8 @@ def main(arguments: Sequence[str]) -> int:
     evaluators = {}
     results = []
     for options, policy in prepare(command, arguments):
-        flown = fly_scenarios(options, policy, evaluators)
-        results.append((options, policy.source, [kind.record() for kind in flown]))
+        records = [kind.record() for kind in fly_scenarios(options, policy, evaluators)]
+        results.append((options, policy.source, records))
     _show(command, results)
     return 0
 

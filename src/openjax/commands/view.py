@@ -130,8 +130,8 @@ def fly_all(command: ViewCommand) -> list[tuple[str, Trajectory]]:
     for policy in command.start():
         # each policy flies the game that it was trained in
         evaluation = EvaluateCommand(**options, episodes=1, environment=policy.settings.environment)
-        flown = fly_scenarios(evaluation, policy, evaluators)
-        flights += [(policy.source, kind.trajectory(0, kind.name)) for kind in flown]
+        for kind in fly_scenarios(evaluation, policy, evaluators):
+            flights.append((policy.source, kind.trajectory(0, kind.name)))
     return flights
 
 
