@@ -21,7 +21,7 @@ from openjax.command_line import run_command
 from openjax.commands import benchmark, diagnose, evaluate, fly, train
 from openjax.evaluation.result_tables import FIELDS
 from openjax.learning import training_step
-from openjax.learning.training_step import make_phases
+from openjax.learning.training_step import Phases, make_phases
 from openjax.pursuit import SCENARIOS
 from openjax.runs import programs
 from openjax.show.metrics import read_metrics
@@ -276,8 +276,10 @@ def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, train_arguments):
 
 
 def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, train_arguments):
-    def make_broken_step(settings, environment, devices):
+    def make_broken_step(settings, environment, devices, part):
         def step(carry):
+            if part is Phases.begin_episodes:
+                return carry, {}
             update = carry.update + 1
             broken = jax.tree.map(lambda leaf: leaf + (0.0 / (update != 4)), carry.policy.actor)
             carry = carry.replace(policy=carry.policy.replace(actor=broken))

@@ -16,9 +16,10 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from openjax.errors import UserError
-from openjax.learning import Parts, TrainCarry, TrainSettings, make_training_step
+from openjax.learning import Parts, TrainCarry, TrainSettings
 from openjax.learning.gradient.first_flights import FirstFlights, FirstWorlds
 from openjax.learning.gradient.stage import GradientStage, StageCarry
+from openjax.learning.training_step import Phases, make_phases
 
 AXIS = "devices"
 _SHARED_OUT = ("observation", "state")
@@ -108,16 +109,22 @@ def own_copy(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: jax.device_put(leaf.addressable_data(0), device), tree)
 
 
-def make_device_step(settings: TrainSettings, parts: Parts, number: int) -> Callable:
-    """The training step `carry -> (carry, metrics)` on `number` devices, not yet
-    compiled.
+def make_device_step(
+    settings: TrainSettings, parts: Parts, number: int, part: Callable = Phases.__call__
+) -> Callable:
+    """The training step `carry -> (carry, metrics)`, or a part of it, a method of
+    `Phases`, on `number` devices, not yet compiled.
     """
+    phases = make_phases(settings, parts, axis=None if number == 1 else AXIS)
+
+    # a function by its name, as the compiler's cache knows programs by theirs
+    def step(carry):
+        return part(phases, carry)
+
     if number == 1:
-        return make_training_step(settings, parts)
-    step = make_training_step(settings, parts, axis=AXIS)
+        return step
     carry = _carry_of(PartitionSpec(AXIS), PartitionSpec())
-    same = PartitionSpec()
-    return _shared_out(number, step, (carry,), (carry, same))
+    return _shared_out(number, step, (carry,), (carry, PartitionSpec()))
 
 
 def make_device_first_flights(

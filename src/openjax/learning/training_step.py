@@ -184,12 +184,21 @@ class Phases:
         """The whole step; its operations bear the parts' names, by which a profile
         tells them apart.
         """
+        carry, metrics = self.fly_and_learn(carry)
+        carry, counts = self.begin_episodes(carry)
+        return carry, metrics | counts
+
+    def fly_and_learn(self, carry: TrainCarry) -> tuple[TrainCarry, dict[str, Scalar]]:
+        """The step without its last part."""
         carry, experience, metrics = _under_its_name(self.fly)(carry)
         for learn in self.learn:
             carry, measures = _under_its_name(learn)(carry, experience)
             metrics |= measures
-        carry, counts = _under_its_name(self.renew)(carry)
-        return carry, metrics | counts
+        return carry, metrics
+
+    def begin_episodes(self, carry: TrainCarry) -> tuple[TrainCarry, dict[str, Scalar]]:
+        """The step's last part, `renew`."""
+        return _under_its_name(self.renew)(carry)
 
 
 def _under_its_name(phase):
@@ -208,7 +217,7 @@ def make_phases(
 
 
 def make_training_step(
-    settings: TrainSettings, parts: Parts | None = None, axis: str | None = None
+    settings: TrainSettings, parts: Parts | None = None
 ) -> Callable[[TrainCarry], tuple[TrainCarry, dict[str, jax.Array]]]:
     """The training step `carry -> (carry, metrics)` as one function; compile it with
     `jax.jit(step, donate_argnums=0)`.
@@ -216,10 +225,8 @@ def make_training_step(
     Args:
       settings: of the run.
       parts: environment, policy and learners; None: those that the settings name.
-      axis: name of the axis of devices when it runs under `shard_map` (see
-      `openjax.cluster.devices`).
     """
-    phases = make_phases(settings, parts, axis)
+    phases = make_phases(settings, parts)
     # a function by its name, as the compiler's cache knows programs by theirs
     return lambda carry: phases(carry)
 
