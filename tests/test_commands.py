@@ -158,9 +158,10 @@ def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(
     (out / ".writing-1-policy.npz").touch()  # a kill in the middle of another file
     printed = finish(start(["openjax.train", "--resume", str(out), *STEPS[2:]]))
     assert f"resumed at update {reached} of {UPDATES}" in printed
-    # the step is compiled once, also for a restored carry
+    # the step's two programs are compiled once, also for a restored carry
     for said in (whole_run[1], printed):
-        assert said.count("Finished XLA compilation of jit(step)") == 1
+        for program in ("fly_and_learn", "begin_episodes"):
+            assert said.count(f"Finished XLA compilation of jit({program})") == 1
     assert not list(out.glob(".writing-*"))
     whole = Checkpoints(whole_run[0] / "checkpoints").latest()
     again = checkpoints.latest()

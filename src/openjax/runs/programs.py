@@ -165,7 +165,9 @@ def _start_and_step(job):
         make_device_step(settings, job.parts, job.devices, part)
         for part in (Phases.fly_and_learn, Phases.begin_episodes)
     )
-    step = TrainingStep(program("learn", learn, 1), program("begin", guarded(begin), 2))
+    step = TrainingStep(
+        program("fly_and_learn", learn, 1), program("begin_episodes", guarded(begin), 2)
+    )
     return _kept_start(start, carry, shardings, keep) if keep else start, step, carry
 
 
