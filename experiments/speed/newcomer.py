@@ -20,6 +20,7 @@ from openjax.command_line import run_command
 
 COMMANDS = {
     "import openjax": ("≤ 1", "-c", "import openjax"),
+    "import openjax; openjax.make()": ("–", "-c", "import openjax; openjax.make()"),
     "openjax --help": ("≤ 0.5", "-m", "openjax", "--help"),
     "openjax evaluate --scenario empty --episodes 1": (
         *("≤ 5", "-m", "openjax", "evaluate", "--scenario", "empty", "--episodes", "1"),
