@@ -74,7 +74,7 @@ def study(options: argparse.Namespace) -> dict:
             for what, (goal, *arguments) in COMMANDS.items()
         ]
     speeds = []
-    for name in ("openjax/Pursuit-v0", "CartPole-v1", "Pendulum-v1"):
+    for name in ("openjax/Pursuit-v0", "CartPole-v1"):
         for number in (64, 1024):
             way = "vector_entry_point" if name.startswith("openjax") else "sync"
             environment = gymnasium.make_vec(name, number, vectorization_mode=way)
