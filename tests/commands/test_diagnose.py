@@ -4,10 +4,12 @@ several vehicles beside each other.
 
 import dataclasses
 import errno
+import gc
 import json
 
 import pytest
 
+from openjax.commands import sample_flights
 from openjax.commands.diagnose import main
 from openjax.errors import UserError
 from openjax.gap.identification.quantities import Quantity
@@ -109,3 +111,17 @@ def test_vehicles_differ_by_more_than_errors():
     ]
     assert [d.vehicle for d in differences(three)] == ["b"]
     assert "c/report.html" in page_of_fleet(three)
+
+
+@pytest.mark.slow
+def test_diagnoses_in_one_process_leave_nothing_behind(tmp_path):
+    sample_flights.main([str(tmp_path / "flights"), "--effect", "rotor_drag"])
+    arguments = [str(tmp_path / "flights"), "--out", str(tmp_path / "out"), "--overwrite"]
+    left = []
+    for _ in range(5):
+        assert main(arguments) == 0
+        gc.collect()
+        left.append(len(gc.get_objects()))
+    # a figure that stays open is some thousand objects, a compiled program some hundred;
+    # the first one loads and compiles, and memory itself goes up and down by a quarter
+    assert max(left[2:]) - left[1] < 100, left
