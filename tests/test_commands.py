@@ -436,7 +436,7 @@ def wrong_layout(change):
             "it observes in world, the run in heading",
         ),
         (train, "--compare_with opne", "policy opne: no such file"),
-        (train, "--devices 1000", "expected all or a number up to"),
+        (train, "--devices 1000", "expected all, or a number up to"),
         (evaluate, "--policy {folder}", "is no policy"),
         (
             evaluate,
@@ -449,7 +449,7 @@ def wrong_layout(change):
         (
             evaluate,
             "--policy {run} --environment.evaders learned",
-            "a name isn't enough; --opponent takes a file",
+            "needs a file: give --opponent one that openjax exploit",
         ),
         (
             evaluate,

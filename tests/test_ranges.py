@@ -115,7 +115,7 @@ def test_the_ends_belong_to_an_interval_as_its_brackets_say():
     assert 0 not in Interval("(0, 1]") and 1 in Interval("(0, 1]")
     assert 0 in Interval("[0, 1)") and 1 not in Interval("[0, 1)")
     for wrong in ("[1, 0]", "[0, inf]", "0..1", "[0 1]"):
-        with pytest.raises(ValueError, match="no bounded interval"):
+        with pytest.raises(ValueError, match="isn't a bounded interval"):
             Interval(wrong)
 
 

@@ -55,7 +55,7 @@ def _read(path, what, language, parse: Callable[[str], Any]):
         if not path.exists():
             raise UserError(f"{path}: no such {what}")
         if not path.is_file():
-            raise UserError(f"{path}: is no file; the {what} is one{_example(path, language)}")
+            raise UserError(f"{path}: isn't a file; the {what} is one{_example(path, language)}")
         if path.stat().st_size > LARGEST_TEXT:
             raise UserError(f"{path}: {path.stat().st_size} bytes are too many for a {what}")
         # editors of Windows begin with a mark
@@ -262,7 +262,7 @@ def check_output(path: str | Path | None, option: str) -> None:
         with tempfile.TemporaryFile(dir=path.parent):
             pass
         if path.exists() and not os.access(path, os.W_OK):
-            raise UserError(f"{option} {path}: may not be written to")
+            raise UserError(f"{option} {path}: you may not write there")
 
 
 @contextlib.contextmanager
@@ -300,7 +300,7 @@ def check_room(path: str | Path, size: int, option: str) -> None:
     free = shutil.disk_usage(parent).free
     if free < size:
         raise UserError(
-            f"{option} {path}: {free / 1e6:.0f} MB are free there, {size / 1e6:.0f} MB are needed"
+            f"{option} {path}: only {free / 1e6:.0f} MB are free; {size / 1e6:.0f} MB are needed"
         )
     if not hasattr(os, "posix_fallocate"):
         return

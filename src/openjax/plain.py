@@ -130,8 +130,8 @@ def _was_setting(kind, key, entries, place):
     value = entries[key]
     if not is_off and (isinstance(value, bool) != isinstance(constant, bool) or value != constant):
         raise UserError(
-            f"{_place(place, key)} is {shown(value)}; it was a setting once, and is always "
-            f"{constant} now"
+            f"{_place(place, key)} is {shown(value)}; it is no longer a setting and is always "
+            f"{constant}"
         )
     return True
 

@@ -32,7 +32,7 @@ class Interval:
     def __post_init__(self):
         is_interval = self._parts and self.low < self.high
         if not (is_interval and math.isfinite(self.low) and math.isfinite(self.high)):
-            raise ValueError(f"{self.notation!r} is no bounded interval")
+            raise ValueError(f"{self.notation!r} isn't a bounded interval")
 
     @functools.cached_property
     def _parts(self):

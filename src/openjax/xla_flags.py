@@ -32,8 +32,8 @@ def avoid_wrong_sums() -> None:
     os.environ["XLA_FLAGS"] = f"{flags} {WITHOUT_SUMS}".strip()
     if _computes_on_cpu():
         warnings.warn(
-            "JAX computed before openjax was imported: on a CPU its release 0.10.2 sums wrongly "
-            f"(JAX issue 39103); import openjax first, or set XLA_FLAGS={WITHOUT_SUMS}",
+            "JAX computed before openjax was imported, and JAX 0.10.2 may sum wrongly on a CPU "
+            f"(JAX issue 39103): import openjax first, or set XLA_FLAGS={WITHOUT_SUMS}",
             RuntimeWarning,
             # the line that imports openjax; frames of importing itself are left out
             stacklevel=3,

@@ -65,7 +65,7 @@ def test_faults_of_the_machine_are_no_faults_of_the_program(answers, tmp_path, c
     assert main(["full", "broken", "good", "--out", str(out), "--no-html"]) == 0
     full, broken = capsys.readouterr().err.splitlines()
     assert full == "error: full: /somewhere: no space left on device"
-    assert broken.startswith("error: broken: KeyError") and "fault of the program" in broken
+    assert broken.startswith("error: broken: KeyError") and "bug in openjax" in broken
     assert [path.name for path in out.iterdir()] == ["good"]
     # nothing diagnosed: nothing is left
     assert main(["full", "--out", str(tmp_path / "other"), "--no-html"]) == 2

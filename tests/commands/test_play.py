@@ -148,5 +148,5 @@ def test_pages_of_other_hosts_are_refused(page):
 def test_what_makes_no_sense_is_refused():
     with pytest.raises(UserError, match="unknown setting --opponent"):
         main(["--opponent", "greedy"])
-    with pytest.raises(UserError, match="one layout or uniform"):
+    with pytest.raises(UserError, match="name one layout, or uniform"):
         main(["--scenario", "all"])

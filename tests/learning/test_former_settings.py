@@ -30,7 +30,7 @@ def test_a_former_setting_with_its_constants_value_is_ignored():
     [("mappo", "huber", 5.0), ("predictor", "loss", "squared"), ("predictor", "decay", 1)],
 )
 def test_a_former_setting_with_another_value_is_one_line(group, name, value):
-    with pytest.raises(UserError, match=f"{group}.{name} is .* it was a setting once, and is"):
+    with pytest.raises(UserError, match=f"{group}.{name} is .* it is no longer a setting and"):
         from_plain(TrainSettings, with_former(group, **{name: value}), "a.json: ")
 
 

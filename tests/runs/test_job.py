@@ -100,7 +100,7 @@ def test_a_run_that_another_jax_goes_on_with_says_so():
 
     assert other_compiler(facts(jax.__version__)) is None
     assert other_compiler({}) is None
-    assert f"JAX 0.9.1 so far; JAX {jax.__version__} goes on" in other_compiler(facts("0.9.1"))
+    assert f"JAX 0.9.1 so far; JAX {jax.__version__} rounds" in other_compiler(facts("0.9.1"))
 
 
 def job_of(settings, tmp_path, **options):

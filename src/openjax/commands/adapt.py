@@ -23,7 +23,7 @@ def main(arguments: Sequence[str]) -> int:
     """
     command = parse(AdaptCommand, AdaptCommand(), arguments, "openjax adapt")
     if not command.flights.exists():
-        raise UserError(f"{command.flights}: no such folder of flights, nor effects.toml")
+        raise UserError(f"{command.flights}: no such folder of flights, and no such effects.toml")
     check_output_folder(command.out, "--out")
     if command.out.exists() and not command.overwrite:
         raise UserError(f"{command.out} already exists: choose another --out or give --overwrite")

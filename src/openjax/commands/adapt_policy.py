@@ -203,9 +203,9 @@ def _results(command, vehicle, rates, tuning) -> dict:
             for which, figures in rates.items()
         },
         "won_back": won_back(rates),
-        "kept": f"fine-tuned, as it was after step {tuning.update}"
+        "kept": f"the fine-tuned policy of step {tuning.update}"
         if tuning.update
-        else "the policy as it was",
+        else "the policy as it was before",
         "history": tuning.history,
         "looks": tuning.looks,
     }
@@ -269,7 +269,7 @@ def _diagnosis(command: AdaptCommand) -> Iterator[Callable[[], Path]]:
     def effects():
         complaint = process.communicate()[1].strip()
         if process.returncode != 0:
-            last = complaint.splitlines()[-1] if complaint else "it ended without a word"
+            last = complaint.splitlines()[-1] if complaint else "it gave no reason"
             raise UserError(f"{name}: no diagnosis: {last.removeprefix('error: ')}")
         return out / name / "effects.toml"
 

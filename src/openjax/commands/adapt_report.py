@@ -24,7 +24,7 @@ def in_words(results: dict) -> list[str]:
         for name, share in results["won_back"].items()
         if share is not None
     ]
-    gain = "The vehicle costs nothing beyond chance."
+    gain = "What the vehicle costs is within chance."
     if gains:
         gain = f"Won back of what the vehicle costs: {', '.join(gains)}."
     return [

@@ -36,7 +36,7 @@ def main(arguments: Sequence[str]) -> int:
 
     # said before minutes of compiling
     if max(command.devices) > (available := len(jax.devices())):
-        raise UserError(f"--devices is {max(command.devices)}; {available} are here")
+        raise UserError(f"--devices is {max(command.devices)}; this machine has {available}")
     from openjax.commands.benchmark_cases import cases, time_compiled
     from openjax.runs.machine import describe_machine
 
@@ -104,8 +104,8 @@ def _programs_and_step(rows) -> str | None:
         return None
     seconds = sum(row["seconds"] for row in rows if row["part"] == "training")
     return (
-        f"the training step's programs take {1e3 * sum(phases):,.1f} ms, the step as one "
-        f"{1e3 * seconds:,.1f} ms"
+        f"the parts of the training step take {1e3 * sum(phases):,.1f} ms one by one, the "
+        f"whole step {1e3 * seconds:,.1f} ms"
     )
 
 

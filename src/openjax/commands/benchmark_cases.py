@@ -89,7 +89,7 @@ def fitting_settings(settings: TrainSettings, num_envs: int, devices: int = 1) -
         except UserError:
             continue
     raise UserError(
-        f"training_envs {num_envs}: no number of environments from there on fits the settings"
+        f"training_envs {num_envs}: neither this nor any larger number fits the settings"
     )
 
 

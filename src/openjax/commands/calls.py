@@ -94,7 +94,7 @@ def train(
         status = start(command, ["(called from Python)"], time.monotonic(), Processes(), parts)
     run = command.resume or command.out
     if status:
-        raise UserError(f"training in {run} stopped at a NaN; what is left to look at lies there")
+        raise UserError(f"training in {run} stopped at a NaN; its state is kept there")
     return load_policy(run, parts.environment, parts.policy)
 
 

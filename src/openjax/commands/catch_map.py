@@ -67,14 +67,14 @@ def map_game(command: MapCommand, game: PursuitSettings) -> PursuitSettings:
             raise UserError(f"--{name} needs at least one number")
     if command.best_response and not command.messages.perfect:
         raise UserError(
-            "--best_response: nobody learns against a team whose messages are lost or late; with "
-            "--best_response False scripted evaders fly alone"
+            "--best_response: evaders can't learn against a team whose messages are lost or late; "
+            "--best_response False flies scripted evaders alone"
         )
     largest = max(command.sizes)
     if not game.team_sizes and set(command.sizes) != {game.num_pursuers}:
         raise UserError(
-            f"--sizes {' '.join(map(str, command.sizes))}: policy {command.policy} flies with "
-            f"{game.num_pursuers} pursuers only"
+            f"--sizes {' '.join(map(str, command.sizes))}: policy {command.policy} flies only "
+            f"{game.num_pursuers} pursuers"
         )
     return dataclasses.replace(
         game.of_one_team(largest),

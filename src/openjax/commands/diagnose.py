@@ -38,7 +38,7 @@ SECONDS = 5.0
 """Of a case on a laptop, about."""
 TOGETHER = "vehicles"
 """What the report of several vehicles is called."""
-_WITHOUT_HELP = f"Effects that are not to be looked for: any of {', '.join(effect_names())}."
+_WITHOUT_HELP = f"Effects to leave out of the search, any of {', '.join(effect_names())}."
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,4 @@ def _unforeseen(name: str, error: Exception) -> str:
     place = traceback.extract_tb(error.__traceback__)[-1]
     line = f"{Path(place.filename).name}:{place.lineno}"
     text = " ".join(str(error).split())
-    return (
-        f"{name}: {type(error).__name__} in {line} ({text}): a fault of the program, please "
-        "report it"
-    )
+    return f"{name}: {type(error).__name__} in {line} ({text}): a bug in openjax; please report it"

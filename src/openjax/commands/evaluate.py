@@ -226,12 +226,12 @@ def find_game(command: EvaluateCommand, policy: "LoadedPolicy") -> tuple:
     settings = _settings(command)
     if "learned" in settings.evaders and command.opponent is None:
         raise UserError(
-            "--environment.evaders learned: a name isn't enough; --opponent takes a file of "
-            "openjax exploit"
+            "--environment.evaders learned needs a file: give --opponent one that openjax exploit "
+            "wrote"
         )
     if not command.messages.perfect and policy.is_heuristic:
         raise UserError(
-            f"--messages: {policy.source} flies the team as one; policies that were trained fly "
+            f"--messages: {policy.source} flies the team as one; only trained policies fly "
             "each pursuer by what it knows"
         )
     number = settings.num_pursuers

@@ -158,8 +158,8 @@ def _draws(policy):
         return None
     if settings.strategy_odds_unseen:
         raise UserError(
-            f"policy {policy.source} draws by other odds while nobody sees the evader, which an "
-            "exported one can't; mix it without --odds_unseen"
+            f"policy {policy.source} has other odds while nobody sees the evader, which an "
+            "exported policy can't have; mix it without --odds_unseen"
         )
     steps = min(settings.strategy_steps, settings.episode_length)
     seconds = round(steps * settings.time_step, 6)
@@ -289,7 +289,7 @@ def main(arguments: Sequence[str]) -> None:
     with Steps(f"exporting {options.policy}", STEPS, console) as steps:
         report = export(options, steps.begin)
     difference = report["largest_difference"]
-    comparison = "not compared with the policy, as there is no C compiler here"
+    comparison = "not compared with the policy: there is no C compiler here"
     if difference is not None:
         comparison = f"differs by at most {difference:.1e} on {report['observations']} observations"
     console.print(

@@ -141,9 +141,7 @@ def _fly(arguments: Arguments, preparation: Prepared | None) -> None:
         outcome = session.fly(flight)
     _show(console, flight, arguments.plan is not None)
     if session.scheduler != "real time":
-        console.print(
-            "no real-time scheduler: on a busy machine deadlines are missed (docs/flying.md)"
-        )
+        console.print("no real-time scheduling: a busy machine misses deadlines (docs/flying.md)")
     if outcome.folder is not None:
         console.print(f"{outcome.folder}: {_next(outcome)}", soft_wrap=True)
     if outcome.complaint:
@@ -155,9 +153,9 @@ def _next(outcome) -> str:
     from openjax.flights.airborne import SHORTEST
 
     if outcome.longest >= SHORTEST:
-        return f"next, openjax diagnose {outcome.folder}"
+        return f"next: openjax diagnose {outcome.folder}"
     if outcome.longest:
-        return f"{outcome.longest:.1f} s of a game; a diagnosis needs {SHORTEST:g} s of one flight"
+        return f"the longest game took {outcome.longest:.1f} s; a diagnosis needs {SHORTEST:g} s"
     return "no game was flown; flight.json says why the flight ended"
 
 
@@ -270,7 +268,7 @@ def _remarks(arguments: Arguments, settings, vehicle, seconds: float) -> tuple[s
     remarks = _time_remark(arguments, seconds)
     if vehicle.airframe == settings.airframe:
         return remarks
-    other = f"the policy was trained for {settings.airframe}; what flies is {vehicle.airframe}"
+    other = f"the policy was trained for {settings.airframe}, but {vehicle.airframe} flies"
     return (other, *remarks)
 
 
@@ -348,7 +346,7 @@ def check(arguments: Arguments) -> Arguments:
             arguments = dataclasses.replace(arguments, uri=Arguments.uri[:1])
         if len(uris_of(arguments)) != 1:
             raise UserError(
-                f"--plan flies one vehicle, {len(uris_of(arguments))} are named: name one --uri"
+                f"--plan flies one vehicle, --uri names {len(uris_of(arguments))}: name one"
             )
     uris = [endpoint.uri for endpoint in endpoints_of(uris_of(arguments))]
     number = len(arguments.uri)

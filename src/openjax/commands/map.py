@@ -85,7 +85,7 @@ def _show(command, results, console):
     )
     least = min(cells, key=lambda cell: cell["capture_rate"])
     console.print(
-        f"{command.out}: {len(cells)} cells of {command.episodes} episodes; the least is "
+        f"{command.out}: {len(cells)} cells of {command.episodes} episodes; the lowest rate is "
         f"{least['capture_rate']:.2f}, with {least['num_pursuers']} pursuers, "
         f"{least['speed_ratio']:g} times their speed and {least['capture_radius']:g} m",
         soft_wrap=True,

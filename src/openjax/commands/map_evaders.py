@@ -155,13 +155,13 @@ class MapEvaders:
         """
         if not path.is_file():
             raise UserError(
-                f"--learned {path}: no such file; openjax map writes one by --evaders_out"
+                f"--learned {path}: no such file; openjax map writes one with --evaders_out"
             )
         leaves, _, notes = load_policy_file(path, "file of a map's evaders", "openjax map")
         if "map_evaders/world_axes" not in leaves:
             raise UserError(
-                f"--learned {path}: holds no evaders of a map; openjax map writes one by "
-                "--evaders_out"
+                f"--learned {path}: holds no evaders of a map; openjax map writes them "
+                "with --evaders_out"
             )
         learners = len(leaves["map_evaders/world_axes"])
         settings = dataclasses.replace(self.command.learning, learners=learners)

@@ -78,7 +78,7 @@ def main(arguments: Sequence[str]) -> None:
     )
     console = output_console()
     console.print(
-        f"{options.out}: draws one of {number} policies "
+        f"{options.out}: switches at random among {number} policies "
         + (f"every {options.seconds:g} s" if options.seconds else "for each episode"),
         soft_wrap=True,
     )

@@ -54,7 +54,7 @@ def make_plan(arguments: Arguments) -> list[str]:
     promises: list[dict] = []
     if arguments.diagnosis == STANDARD and not Path(STANDARD).exists():
         segments = list(SEGMENTS)
-        sentence = "The standard plan: it shows every effect that one vehicle can show."
+        sentence = "The standard plan shows every effect that one vehicle can show."
     else:
         sentence, promises, segments = _advise(arguments)
     plan = plan_of(segments)
@@ -68,7 +68,7 @@ def make_plan(arguments: Arguments) -> list[str]:
         f"  {p['segment']:6} {p['value']:.3f}  {SEGMENTS[p['segment']].shows}" for p in promises
     ]
     if rows:
-        rows.insert(0, "How probably a segment tells two of the believed causes apart:")
+        rows.insert(0, "Probability that a segment tells two of the likely causes apart:")
     file = arguments.out / "plan.csv"
     seconds = len(plan) * PERIOD
     limit = SafetySettings().alone_time

@@ -43,7 +43,7 @@ def main(arguments: Sequence[str]) -> int:
     """
     command = parse(PlayCommand, PlayCommand(), arguments, PROGRAM)
     if command.scenario == "all":
-        raise UserError("--scenario all: one layout or uniform would be right")
+        raise UserError("--scenario all: name one layout, or uniform")
     table = make_table(command)
     from openjax.commands.play_server import play_server
 
@@ -68,7 +68,7 @@ def make_table(command: PlayCommand):
 
     policies = command.start()
     if len(policies) != 1:
-        raise UserError(f"--policy: {len(policies)} policies; one hunts you at a time")
+        raise UserError(f"--policy names {len(policies)} policies; name the one that hunts you")
     (policy,) = policies
     options = {
         field.name: getattr(command, field.name) for field in dataclasses.fields(FlightOptions)

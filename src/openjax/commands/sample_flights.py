@@ -20,7 +20,7 @@ PROGRAM = "openjax sample_flights"
 DECIMALS = {"t": 2, "vbat": 3} | dict.fromkeys("x y z qw qx qy qz m1 m2 m3 m4".split(), 5)
 _REST = 4  # decimals of all other columns
 _EFFECT_HELP = (
-    "What the vehicle suffers from that the simulator doesn't know, one effect or several at once: "
+    "Effects of the vehicle that the simulator lacks, one or several: "
     f"none, {', '.join(effect_names())}."
 )
 
@@ -86,7 +86,7 @@ def _checked_effects(names: tuple[str, ...], library: Collection[str]) -> tuple[
     is_unclear = "none" in names and len(names) > 1
     if len(set(names)) < len(names) or not names or is_unclear:
         words = " ".join(names) or "nothing"
-        raise UserError(f"--effect {words}: name none alone, or each effect that acts once")
+        raise UserError(f"--effect {words}: name none alone, or each effect once")
     return tuple(name for name in names if name != "none")
 
 

@@ -107,7 +107,7 @@ def write_flights(command: ViewCommand) -> None:
     from openjax.show.foxglove import write_mcap
 
     if command.mcap is None:
-        raise UserError("--flights shows logs in Foxglove: name the file to write, --mcap FILE")
+        raise UserError("--flights writes logs for Foxglove: name the file by --mcap FILE")
     nameless = not (command.flights / "vehicle.toml").exists()
     # to look at, any vehicle will do
     case = load_case(command.flights, comparison=nameless)

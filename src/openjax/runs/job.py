@@ -95,8 +95,8 @@ def check_job(job: TrainingJob) -> None:
     settings = job.settings
     if settings.environment.strategies != 1:
         raise UserError(
-            f"--environment.strategies {settings.environment.strategies}: the members of "
-            "a team that draws are trained one by one, then openjax mix makes one of them"
+            f"--environment.strategies {settings.environment.strategies}: train the members of a "
+            "team one by one, then join them with openjax mix"
         )
     check_devices(settings, job.devices)
     check_memory(settings, job.devices)
@@ -104,8 +104,8 @@ def check_job(job: TrainingJob) -> None:
         settings.first_flights.updates or settings.analytic.updates
     ):
         raise UserError(
-            "first_flights.updates and analytic.updates must be 0 for a policy of one's "
-            "own: these stages need the shipped networks"
+            "first_flights.updates and analytic.updates must be 0 for a network of your "
+            "own: these stages need the shipped ones"
         )
 
 

@@ -246,8 +246,8 @@ def other_compiler(facts: dict) -> str | None:
     if version in (None, jax.__version__):
         return None
     return (
-        f"this run was trained by JAX {version} so far; JAX {jax.__version__} goes on with it, but "
-        "rounds differently: what follows isn't bit for bit what it would have been"
+        f"this run was trained with JAX {version} so far; JAX {jax.__version__} rounds differently, "
+        "so from here on it isn't bit for bit the same run"
     )
 
 
@@ -269,13 +269,13 @@ def _check_parts(parts, files, facts):
     that is resumed, whose facts these are.
     """
     if parts.environment is not None and any(files.values()):
-        raise UserError("an environment of one's own has its vehicle, effects and evader already")
+        raise UserError("an environment of your own already has its vehicle, effects and evader")
     # a new run may have any; one that is resumed and says nothing had none
     first = facts.get("own_parts", []) if facts else parts.names
     if first != parts.names:
         raise UserError(
-            f"the run was begun with {', '.join(first) or 'no part'} of one's own, here are "
-            f"{', '.join(parts.names) or 'none'}; openjax.train(resume=...) takes the same ones"
+            f"the run was begun with {', '.join(first) or 'no part'} of your own, and now has "
+            f"{', '.join(parts.names) or 'none'}; pass openjax.train(resume=...) the same ones"
         )
 
 
@@ -336,7 +336,7 @@ def check_resumed(command: TrainCommand, stored_settings: TrainSettings) -> None
     """
     resume = command.resume
     if command.out is not None and command.out.resolve() != resume.resolve():
-        raise UserError(f"--resume {resume} writes there; leave --out away")
+        raise UserError(f"--resume {resume} writes there; don't give --out")
     if command.overwrite:
         raise UserError("--resume and --overwrite exclude each other")
     options = ["start_from", "effects", "vehicle", "opponent"]
@@ -368,8 +368,5 @@ def _devices(text, settings, saved_settings):
     if text == "all":
         return available
     if not (text.isdecimal() and len(text) <= 9 and 1 <= int(text) <= available):
-        raise UserError(
-            f"--devices is {text[:40]!r}; expected all or a number up to the {available} that are "
-            "here"
-        )
+        raise UserError(f"--devices is {text[:40]!r}; expected all, or a number up to {available}")
     return int(text)

@@ -42,7 +42,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
         is_done = checkpoints.reach(settings.total_updates)
         if is_done:
             progress.message(
-                "all updates are done; --total_steps N goes on to more. Its report is made again"
+                "all updates are done, and the report is made again; --total_steps N adds more"
             )
         progress.phase("compiling the start: networks, first tasks", announce=not has_begun)
         try:
