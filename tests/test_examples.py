@@ -82,7 +82,7 @@ def test_a_part_of_ones_own_is_trained(part, tiny_preset, tmp_path, capsys):
         openjax.train(resume=run)
     if part == "network":
         assert f'openjax.load_policy("runs/own_{part}", ' in printed
-        with pytest.raises(openjax.UserError, match="a network of one's own: in Python"):
+        with pytest.raises(openjax.UserError, match="a network of your own: load it in Python"):
             openjax.load_policy(run)
     if part == "learner":
         longer = dataclasses.replace(example["settings"], total_steps=960)

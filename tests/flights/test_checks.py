@@ -294,7 +294,7 @@ def test_a_case_that_cannot_be_used_is_one_line(case_folder, prepare, reason):
 
 
 def test_a_folder_of_cases_says_where_they_are(case_folder):
-    with pytest.raises(UserError, match=f"cases are folders in it: {case_folder.name}, in all 1"):
+    with pytest.raises(UserError, match=rf"cases inside it: {case_folder.name} \(1 in all\)"):
         load_case(case_folder.parent)
 
 

@@ -131,7 +131,7 @@ def test_no_packet_breaks_it(data, header):
 
 @pytest.mark.parametrize("host, port", [("127.0.0.1", 65536), ("nohost.invalid", 1), ("x" * 80, 1)])
 def test_an_address_that_cannot_be_had_is_named(host, port):
-    with pytest.raises(UserError, match=f"UDP port {port} of {host} can't be had"):
+    with pytest.raises(UserError, match=f"UDP port {port} of {host} can't be opened"):
         VirtualLink(host, port, LinkFaults(), 0)
 
 

@@ -262,7 +262,7 @@ def _accept(server, number):
         except TimeoutError:
             absent = ", ".join(str(i) for i in range(1, number) if i not in others)
             raise UserError(
-                f"process {absent} of {number} didn't come within {JOIN:.0f} s"
+                f"process {absent} of {number} didn't join within {JOIN:.0f} s"
             ) from None
         connection.settimeout(10.0)
         reader = connection.makefile("rb")

@@ -180,7 +180,7 @@ class Writer(Walk):
         # as they are
         if target == "b" and source != "b":
             raise UserError(
-                "the policy turns numbers into flags, which the C export doesn't know yet"
+                "the policy turns numbers into flags, which the C export doesn't support yet"
             )
         return operation.inputs[0]
 

@@ -170,7 +170,7 @@ def outer_padding(operation: Operation) -> tuple[list[int], list[int]]:
     """
     low, high, between = zip(*operation.parameters["padding_config"], strict=True)
     if any(between) or min(*low, *high, 0) < 0:
-        raise UserError("the policy pads between entries or cuts, which no export knows yet")
+        raise UserError("the policy pads between entries or cuts, which no export supports yet")
     return list(low), list(high)
 
 

@@ -144,7 +144,7 @@ def _unit(pair: Pair) -> list[Finding]:
     if (gains < SAME).any() and (gains > 1 / SAME).any():
         return []
     text = f"{', '.join(pair.names)} are {np.median(gains):.2g} times {pair.what}"
-    return [("units", f"{text}: one of them is something else", [pair.what])]
+    return [("units", f"{text}: one of them holds something else", [pair.what])]
 
 
 def _inversions(signals: Signals) -> list[Finding]:

@@ -155,7 +155,7 @@ def _called_otherwise(path: Path) -> str:
 def _cases_inside(path):
     """In words: which cases a folder holds, where somebody gave the one above."""
     cases = sorted(file.parent.name for file in path.glob("*/vehicle.toml"))
-    return f"; cases are folders in it: {cases[0]}, in all {len(cases)}" if cases else ""
+    return f"; cases inside it: {cases[0]} ({len(cases)} in all)" if cases else ""
 
 
 def _usable(
@@ -198,8 +198,8 @@ def _without_distrust(
             out.append(flight)
         else:
             text = (
-                f"too calm to show that it doesn't contradict {doubts[0]}, as other flights of the "
-                "case do"
+                f"other flights of the case contradict {doubts[0]}, and this one is too calm to be "
+                "checked"
             )
             refusals.append(Issue(flight.name, text, refused=True, kind="garbage"))
     return out, refusals

@@ -76,5 +76,7 @@ def _has_what_is_needed(flight: Flight, comparison: bool) -> None:
 def _with_forces(flight: Flight, note) -> Flight:
     """The flight, noted where it holds nothing that a force moves."""
     if not (flight.has_pose or flight.has_imu):
-        note("columns", "no accelerometer, nor a pose: torques alone can be told; log ax, ay, az")
+        note(
+            "columns", "neither accelerometer nor pose: only torques can be judged; log ax, ay, az"
+        )
     return flight

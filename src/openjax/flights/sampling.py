@@ -200,7 +200,7 @@ def put_in_step(flight: Flight, note) -> Flight:
     rate = (len(regular) - 1) / (regular[-1] - regular[0])
     note(
         "held",
-        f"poses come at {rate:.0f} Hz of a clock of their own: moved from it to the rows' times",
+        f"poses come at {rate:.0f} Hz on a clock of their own: they are moved to the rows' times",
     )
     # where the body is after the last pose, or before the first, isn't known
     return dataclasses.replace(flight, **changes).rows(slice(rows[0], rows[-1] + 1))

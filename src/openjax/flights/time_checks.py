@@ -87,7 +87,7 @@ def _written_once(flight: Flight, note) -> Flight:
     repeats = np.r_[False, same.all(1)]
     if not repeats.any():
         return flight
-    note("time", f"{repeats.sum()} rows that stand twice were left out")
+    note("time", f"{repeats.sum()} rows that occur twice were left out")
     return flight.rows(~repeats)
 
 

@@ -47,7 +47,7 @@ def join(logs: Logs) -> tuple[Logs, list[Issue]]:
         else:
             words = (
                 "seem to be vehicles of one flight, each on a clock of its own: put them into one "
-                "file with a column `vehicle` and one time; till then wakes can't be told"
+                "file with a column `vehicle` and one time; until then wakes can't be judged"
             )
             issues.append(Issue(_names(group), words, kind="vehicles"))
     together = tuple(

@@ -85,7 +85,7 @@ def watch(board: Board, parent: int, links: RawLinks, state: State) -> None:
             board.pilot = Role.GUARD
             board.beat(Role.GUARD, time_read + OPENING)
             board.end_process(Role.LINKS)
-            say("openjax fly: nothing from the links' process, the guard lands all vehicles")
+            say("openjax fly: the links' process is silent, so the guard lands all vehicles")
             links.open()
             fly_down(board, Role.GUARD, links, state)
         # on the floor, but armed: whoever comes near must not be met by a motor

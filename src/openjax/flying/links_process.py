@@ -172,8 +172,8 @@ def _watch(swarm: Swarm, board: Board, parent: int, state: State | None) -> None
         is_over = board.pilot is Role.LINKS or (board.pilot is Role.LOOP and silent > board.silence)
         if is_over and board.flying and state is not None:
             say(
-                f"openjax fly: the loop, heard {silent:.2f} s ago, left all vehicles to the links' "
-                "process"
+                f"openjax fly: the loop has been silent for {silent:.2f} s, so the links' process "
+                "lands all vehicles"
             )
             fly_down(board, Role.LINKS, swarm, state)
         if os.getppid() != parent and not board.flying:

@@ -111,19 +111,18 @@ def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
     spot = f"({x:.2f}, {y:.2f}, {z:.2f})"
     if math.dist((x, y), start[:2]) > state.settings.stand or abs(z) > MOST_HEIGHT:
         yield (
-            f"stands at {spot} m, its start's mark is ({start[0]:.2f}, {start[1]:.2f}, 0): put it "
-            "there, or mend the positioning system's axes, origin or unit"
+            f"stands at {spot} m, its mark is ({start[0]:.2f}, {start[1]:.2f}, 0): put it "
+            "there, or correct the positioning system's axes, origin or unit"
         )
     if up(pose.quaternion) < math.cos(MOST_TILT):
-        yield "doesn't stand level; put it upright, or mend the body's axes"
+        yield "doesn't stand level; put it upright, or correct the body's axes"
     elif abs(roll_pitch_yaw(pose.quaternion)[2]) > MOST_YAW:
-        yield "doesn't face +x; turn it, or mend the body's axes"
+        yield "doesn't face +x; turn it, or correct the body's axes"
     if sample.captured is None or sample.own is None:
         return
     if agree(sample.captured, sample.own, limits):
         place = ", ".join(f"{p:.2f}" for p in sample.own.position)
         yield (
-            f"motion capture sees it at {spot} m, itself at ({place}): mend axes, "
-            "unit or origin of "
-            "one of them"
+            f"motion capture sees it at {spot} m, its own estimate at ({place}): correct axes, "
+            "unit or origin of one of them"
         )

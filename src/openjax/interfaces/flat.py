@@ -23,8 +23,7 @@ def game_of(environment: Pursuit | None, changes: dict) -> Pursuit:
     """
     if environment is not None and changes:
         raise UserError(
-            f"{', '.join(changes)} beside an environment: settings are given to the environment, "
-            "or alone"
+            f"{', '.join(changes)} beside an environment: give settings to the environment instead"
         )
     return environment or make(**changes)
 

@@ -246,8 +246,8 @@ def other_compiler(facts: dict) -> str | None:
     if version in (None, jax.__version__):
         return None
     return (
-        f"this run was trained with JAX {version} so far; JAX {jax.__version__} rounds differently, "
-        "so from here on it isn't bit for bit the same run"
+        f"this run was trained with JAX {version} so far; JAX {jax.__version__} rounds "
+        "differently: from here on it isn't bit for bit the same run"
     )
 
 

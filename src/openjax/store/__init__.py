@@ -23,5 +23,5 @@ def default_policy(game: PursuitSettings) -> tuple[str, str]:
     ]
     if not constants:
         return DEFAULT_POLICY, ""
-    line = f"policy {TEAM_POLICY}: {DEFAULT_POLICY} knows {', '.join(constants)} only"
+    line = f"policy {TEAM_POLICY}: {DEFAULT_POLICY} knows only {', '.join(constants)}"
     return TEAM_POLICY, line

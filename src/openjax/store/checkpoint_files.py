@@ -187,7 +187,7 @@ def _checksums_file(path):
 
 def _check_same_shapes(path, metadata, leaves):
     """Raises UserError where a checkpoint's leaves aren't these."""
-    reason = "it was written by other settings or another version"
+    reason = "other settings or another version wrote it"
     for name, leaf in leaves.items():
         if name not in metadata:
             raise UserError(f"checkpoint {path} lacks {name}; {reason}")

@@ -44,13 +44,15 @@ def mixed_policy(policies: Sequence[LoadedPolicy], draws: Draws) -> LoadedPolicy
         for place in range(policy.settings.environment.strategies)
     ]
     if len(policies) < 2:
-        raise UserError("a team that draws needs two policies or more to draw from")
+        raise UserError("a team needs two policies or more to switch among")
     first = policies[0]
     game = common_game([policy.settings.environment for policy in policies])
     environment = Pursuit(game)
     for policy in policies:
         if policy.is_heuristic or not policy.parameters.actor:
-            raise UserError(f"policy {policy.source} has no networks to be drawn")
+            raise UserError(
+                f"policy {policy.source} has no networks: it can't be a member of a team"
+            )
         for part in ("network", "predictor"):
             if getattr(policy.settings, part) != getattr(first.settings, part):
                 raise UserError(

@@ -180,12 +180,12 @@ class LoadedPolicy:
         if sizes != sizes_of_policy:
             raise UserError(
                 f"policy {self.source} observes {sizes_of_policy} (own state, history, axes), "
-                f"here are {sizes}; make its game with openjax.make(policy.settings.environment)"
+                f"this game has {sizes}; make its game with openjax.make(policy.settings.environment)"
             )
         if game.strategies > 1 and observation.strategy is None:
             raise UserError(
-                f"policy {self.source} draws one of {game.strategies} members, here nothing is "
-                "drawn; make its game with openjax.make(policy.settings.environment)"
+                f"policy {self.source} draws one of {game.strategies} members, but this game "
+                "draws none; make its game with openjax.make(policy.settings.environment)"
             )
         return self.policy.act(self.parameters, observation)
 
@@ -288,8 +288,8 @@ def _load_own(run, source, environment, policy):
 def _from_run(run, source):
     if "policy" in run.read_facts().get("own_parts", ()):
         raise UserError(
-            f"{source} was trained with a network of one's own: in Python "
-            "openjax.load_policy(run, environment, network) takes it again"
+            f"{source} was trained with a network of your own: load it in Python, by "
+            "openjax.load_policy(run, environment, network)"
         )
     if run.policy.exists():
         return _from_file(run.policy, source)

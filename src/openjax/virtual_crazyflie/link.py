@@ -51,7 +51,7 @@ class VirtualLink:
             self.socket.close()
             reason = getattr(error, "strerror", None) or error
             raise UserError(
-                f"UDP port {port} of {host} can't be had ({reason}); choose another --port"
+                f"UDP port {port} of {host} can't be opened ({reason}); choose another --port"
             ) from error
         self.socket.setblocking(False)
         self.faults = faults

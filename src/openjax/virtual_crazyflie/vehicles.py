@@ -83,7 +83,7 @@ class VirtualVehicles:
         for effect in self._step.effects:
             if effect.command is not None:
                 raise UserError(
-                    f"effect {effect.name} acts on commands: order it from the link, with "
+                    f"effect {effect.name} acts on commands: set it for the link, by "
                     "--latency_ms or --loss"
                 )
         position = np.atleast_2d(np.asarray(position, np.float32))

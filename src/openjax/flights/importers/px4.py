@@ -109,7 +109,7 @@ def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
             f"{len(log.dropouts)} dropouts of {seconds_lost} ms in all while it was logged"
         )
     if log.file_corruption:
-        remarks.append("the log is corrupt in places: what can be read of it is")
+        remarks.append("the log is corrupt in places; the rest of it is read")
     table = merge_streams(fastest_first, columns)
     table["t"] = table["t"] - table["t"][0]
     return LogTable(path.name, table, np.full(len(table["t"]), "0"), tuple(remarks))

@@ -88,9 +88,8 @@ def read_topic_times(path: Path, mapping: ColumnMapping | None = None) -> LogTab
     streams, begin = _streams(raw, sources, clock_of, mapping)
     if repeats:
         remarks.append(
-            f"columns that others hold already are left out, {repeats[0]} to "
-            f"{repeats[-1]}: a vehicle "
-            "each, a file each"
+            f"columns that repeat others are left out, {repeats[0]} to {repeats[-1]}: log each "
+            "vehicle into a file of its own"
         )
     absent = [source.name for source in sources.values() if source.name not in raw]
     remarks += [f"no column {name!r}" for name in absent]
@@ -111,7 +110,7 @@ def _map(names: list[str], mapping: ColumnMapping) -> dict[str, Source]:
     usual = {name: Source(name) for name in names if name in LOG_COLUMNS[2:]}
     sources = mapping.over(usual)
     if not {source.name for source in sources.values()} & set(names):
-        raise LogError("columns.toml names times, and no column that the log has beside them")
+        raise LogError("columns.toml names times of the log, but none of its other columns")
     return sources
 
 
