@@ -179,8 +179,8 @@ class LoadedPolicy:
         sizes_of_policy = (game.self_size, game.history_length, game.frame_size, game.observe_in)
         if sizes != sizes_of_policy:
             raise UserError(
-                f"policy {self.source} observes {sizes_of_policy} (own state, history, axes), "
-                f"this game has {sizes}; make its game with openjax.make(policy.settings.environment)"
+                f"policy {self.source} observes {sizes_of_policy} (own state, history, axes), this "
+                f"game has {sizes}; make its game with openjax.make(policy.settings.environment)"
             )
         if game.strategies > 1 and observation.strategy is None:
             raise UserError(
