@@ -127,7 +127,7 @@ def test_a_mixed_policy_gives_back_its_members_and_takes_no_others():
         mixed_policy([first, second], Draws(odds=(1.0,)))
     with pytest.raises(UserError, match="evaders, member 0 and open differ in network"):
         mixed_policy([first, openjax.load_policy("open")], Draws())
-    with pytest.raises(UserError, match="here nothing is drawn; make its game"):
+    with pytest.raises(UserError, match="game draws none; make its game"):
         game = Pursuit(first.settings.environment)
         evaders(jax.eval_shape(game.reset, jax.random.key(0))[0])
     with pytest.raises(UserError, match=r"trained with strategies 2, here it's 1"):

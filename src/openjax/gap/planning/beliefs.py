@@ -100,12 +100,12 @@ def advice_for(report: dict, vehicle_file: VehicleFile) -> tuple[str, Advice]:
     beliefs = beliefs_of(report)
     if len(beliefs) < 2:
         raise UserError(
-            "one cause is left in the report, and no flight is needed to tell it from others"
+            "the report leaves one cause, and no flight is needed to tell it from others"
         )
     advice = advise(beliefs, vehicle_file)
     text = sentence(advice, report)
     if not is_open(beliefs):
-        text = f"Little is left open, and no flight is needed. Who wants to be sure: {text}"
+        text = f"Little is left open, and no flight is needed. To be sure anyway: {text}"
     return text, advice
 
 
@@ -151,6 +151,6 @@ def _to_mend(report: dict) -> list[str]:
     reasons = {
         "log the motors' means at 100 Hz": ("sample", remarks),
         "log motors and gyroscope on one clock": ("don't share a clock", report.get("sensors", ())),
-        "log the accelerometer": ("torques alone can be told", issues),
+        "log the accelerometer": ("only torques can be judged", issues),
     }
     return [mend for mend, (sign, texts) in reasons.items() if any(sign in text for text in texts)]
