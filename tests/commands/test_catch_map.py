@@ -120,7 +120,7 @@ def test_intervals_of_proportions_are_wilsons():
 
 def test_a_policy_for_three_has_one_map():
     three = dataclasses.replace(GAME, team_sizes=())
-    with pytest.raises(openjax.UserError, match="flies with 3 pursuers only"):
+    with pytest.raises(openjax.UserError, match="flies only 3 pursuers"):
         map_game(COMMAND, three)
     assert map_game(dataclasses.replace(COMMAND, sizes=(3,)), three).num_pursuers == 3
     with pytest.raises(openjax.UserError, match="--radii needs"):
