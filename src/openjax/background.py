@@ -41,7 +41,7 @@ class Pending:
 
     @property
     def is_ready(self) -> bool:
-        """Whether nobody would have to wait."""
+        """True if nobody would have to wait."""
         return self._future.done()
 
 

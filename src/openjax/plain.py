@@ -113,7 +113,7 @@ def _dataclass_from_plain(kind, value, place):
 
 
 def _was_setting(kind, key, entries, place):
-    """Whether earlier versions had this setting, which is a constant of the class now: of the
+    """True if earlier versions had this setting, which is a constant of the class now: of the
     same name in capitals, or in its `FORMER` where the code doesn't need it.
 
     Raises:

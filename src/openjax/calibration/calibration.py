@@ -87,7 +87,7 @@ class Quantity:
     nominal: tuple[float, ...]
     unit: str
     determined: bool
-    """Whether these flights tell it: only then it goes into a vehicle file."""
+    """True if these flights tell it: only then it goes into a vehicle file."""
     notes: str = ""
 
 

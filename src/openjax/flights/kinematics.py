@@ -43,7 +43,7 @@ class Kinematics:
     clear.
     """
     one_clock: bool
-    """Whether attitude and gyroscope can be compared sample by sample: what their
+    """True if attitude and gyroscope can be compared sample by sample: what their
     streams leave of each other is noise, not time.
     """
     findings: dict[str, str]

@@ -109,7 +109,7 @@ def attitudes(signals: Signals) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _turns_with(signals: Signals, attitude: np.ndarray) -> bool:
-    """Whether an attitude (T, 4) is upright and turns as the gyroscope says."""
+    """True if an attitude (T, 4) is upright and turns as the gyroscope says."""
     if rotation(attitude)[:, 2, 2].mean() < UPRIGHT:
         return False
     if signals.body_rates is None:

@@ -1,4 +1,4 @@
-"""Whether motors are quick or slow, or their commands on another clock: lag and delay
+"""True if motors are quick or slow, or their commands on another clock: lag and delay
 told apart.
 
 Both turn the phase of the answer, and only a lag bends its gain, too. In closed loop gusts

@@ -109,7 +109,7 @@ def _gain(path: np.ndarray, other: np.ndarray) -> tuple[float, float]:
 
 
 def _outside(gain: float, error: float, gains: tuple[float, float]) -> bool:
-    """Whether a gain is beyond these, whatever its error may be."""
+    """True if a gain is beyond these, whatever its error may be."""
     return gain + CLEARLY * error < gains[0] or gain - CLEARLY * error > gains[1]
 
 

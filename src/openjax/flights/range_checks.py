@@ -132,7 +132,7 @@ def _without_saturated(flight: Flight, note) -> Flight:
 
 
 def _piled_up(size: np.ndarray) -> bool:
-    """Whether many more readings are the largest than the one below: else it is the
+    """True if many more readings are the largest than the one below: else it is the
     peak of a motion, which a coarse sensor reads often.
     """
     _, counts = np.unique(size[np.isfinite(size)], return_counts=True)

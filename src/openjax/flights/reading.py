@@ -36,7 +36,7 @@ class LogTable:
     remarks: tuple[str, ...] = field(default=())
     """What was found while reading and doesn't stop it."""
     duty_cycles: bool = False
-    """Whether the format says that m1 to m4 are duty cycles."""
+    """True if the format says that m1 to m4 are duty cycles."""
     clock_start: float | None = None
     """What the log's clock read at t = 0, s: since 1970, or since the flight's start; None
     for a clock of the vehicle's own.

@@ -98,7 +98,7 @@ def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
 
 
 def _may_stand_still(flight: Flight, channel: str, column: int) -> bool:
-    """Whether one column may hold one value while the others of its channel change, as
+    """True if one column may hold one value while the others of its channel change, as
     where a simulated vehicle stays in a plane: what follows from it then stands still,
     too.
     """

@@ -100,7 +100,7 @@ def _of_one_time(flights: list[Flight]) -> list[tuple[str, dict[str, Flight]]]:
 
 
 def _overlap(flight: Flight, *others: Flight) -> bool:
-    """Whether a flight and each of the others fly together."""
+    """True if a flight and each of the others fly together."""
     overlaps = (
         min(_begin(a) + a.duration, _begin(b) + b.duration)
         - max(_begin(a), _begin(b))

@@ -65,7 +65,7 @@ class CaseFolder:
         self.refusal = ""
         """What the first place had against it."""
         self.complete = True
-        """Whether everything was written, here or there."""
+        """True if everything was written, here or there."""
         name = f"openjax-{folder.absolute().name}-{os.getpid()}"
         self._others = [
             place / name
@@ -109,7 +109,7 @@ class CaseFolder:
             self.complete = self.complete and any(self._moves(to, write) for to in self._others)
 
     def _moves(self, place: Path, write: Callable[[Path], None]) -> bool:
-        """Whether all that there is moved to this place, which takes one thing more."""
+        """True if all that there is moved to this place, which takes one thing more."""
         try:
             if self.folder.is_dir():
                 shutil.copytree(self.folder, place)

@@ -184,7 +184,7 @@ class _Book:
 
     @property
     def knows_all(self) -> bool:
-        """Whether the links have told all up to the loop's last tick."""
+        """True if the links have told all up to the loop's last tick."""
         return self._newest["links"] >= self._newest["loop"]
 
     @property

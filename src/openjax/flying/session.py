@@ -45,11 +45,11 @@ class SessionSettings:
     body_logs: int = 1
     """Log blocks of motors and accelerometer, 0 to 5: one is what a radio carries."""
     watchdog: bool = True
-    """Whether the firmware's watchdog stops the motors once nothing feeds it any
+    """True if the firmware's watchdog stops the motors once nothing feeds it any
     more.
     """
     guard: bool = True
-    """Whether a process of its own watches, and lands all should loop and links fall
+    """True if a process of its own watches, and lands all should loop and links fall
     silent.
     """
     silence: float = SILENCE

@@ -96,7 +96,7 @@ def _apply(equation, inputs):
 
 
 def _is_sum(combination):
-    """Whether all that a reduction combines with is addition."""
+    """True if all that a reduction combines with is addition."""
     return {equation.primitive.name for equation in combination.eqns} == {"add"}
 
 

@@ -76,7 +76,7 @@ def _archived_or_uniform(settings, environment, archive, key):
 def successes(
     settings: GeneratorSettings, statistics: EpisodeStatistics, penalty_share: Scalar | float = 1.0
 ) -> Bool[Array, "*worlds"]:
-    """Whether episodes count as solved: captured, and (by setting) with few collisions.
+    """True if episodes count as solved: captured, and (by setting) with few collisions.
     Any leading axes.
 
     `penalty_share` is the share of the penalties that counts by now (0 to 1). As it

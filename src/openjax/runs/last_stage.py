@@ -97,7 +97,7 @@ def _plain(summary):
 
 
 def _is_looked_at(stage, update):
-    """Whether what an update made is validated: every so often, and the last one."""
+    """True if what an update made is validated: every so often, and the last one."""
     return update % stage.look_every == 0 or update == stage.updates
 
 
@@ -117,7 +117,7 @@ def _in_words(facts, updates, score):
 
 
 def _is_better(settings, scores, best):
-    """Whether the last of the scores is kept, beside the one at place `best` so far."""
+    """True if the last of the scores is kept, beside the one at place `best` so far."""
     if settings.worst_plans.worlds:
         return scores[-1] >= scores[0] - TOLERANCE
     return scores[-1] > scores[best]

@@ -118,7 +118,7 @@ class Evaluate(Protocol):
         """Score and metrics on the validation tasks; must not touch the carry."""
 
     def is_ready(self) -> bool:
-        """Whether it would begin at once. Where it waits for the compiler, a signal ends the
+        """True if it would begin at once. Where it waits for the compiler, a signal ends the
         command.
         """
 

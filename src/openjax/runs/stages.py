@@ -44,7 +44,7 @@ class Run:
     stop: StopRequest
 
     def is_over(self, deadline: float) -> bool:
-        """Whether the run is to end: a signal to any process counts, and the first one's
+        """True if the run is to end: a signal to any process counts, and the first one's
         clock (`time.monotonic`).
         """
         answers = self.job.processes.everyone([self.stop.name, time.monotonic() >= deadline])
@@ -61,9 +61,9 @@ class RunState:
     seconds: float
     """... by earlier processes, in so long a time."""
     is_restored: bool
-    """Whether the carry comes from a checkpoint."""
+    """True if the carry comes from a checkpoint."""
     is_due: bool
-    """Whether the carry is to be validated before anything else."""
+    """True if the carry is to be validated before anything else."""
     deadline: float = float("inf")
     """When the time for learning is over (`time.monotonic`)."""
 
@@ -95,7 +95,7 @@ def begin(run: Run) -> RunState:
 
 
 def awaits_validation(record: CheckpointRecord, job: TrainingJob) -> bool:
-    """Whether a run was stopped between a checkpoint and its validation: of the start, after
+    """True if a run was stopped between a checkpoint and its validation: of the start, after
     first flights, or of an update at which one is made. It comes when the run goes on, so
     that it ends as one that nobody stopped.
     """
@@ -212,7 +212,7 @@ class Evaluation:
         return processes.of_first((score, {**flat_metrics(uniform, far_tasks), "score": score}))
 
     def is_ready(self) -> bool:
-        """Whether nobody would have to wait for the compiler."""
+        """True if nobody would have to wait for the compiler."""
         run = self.run
         return run.job.processes.of_first(
             run.programs.validation is not None and run.programs.validation.is_ready

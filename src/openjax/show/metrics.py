@@ -19,7 +19,7 @@ class Continuation(NamedTuple):
     steps: int = 0
     """Environment steps done by then, where TensorBoard's curves go on."""
     drop_validation: bool = False
-    """Whether the validation of this update comes again, too."""
+    """True if the validation of this update comes again, too."""
 
 
 class MetricsWriter:

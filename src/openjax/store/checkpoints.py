@@ -125,7 +125,7 @@ class Checkpoints:
         return records[-1] if records else None
 
     def reach(self, update: int) -> bool:
-        """Whether the newest committed checkpoint is of this update, or a later one; the same
+        """True if the newest committed checkpoint is of this update, or a later one; the same
         for all processes.
         """
         latest = self.latest()

@@ -119,7 +119,7 @@ class BestResponseSettings:
         return self.widths[learner % len(self.widths)]
 
     def sees_in_world(self, learner: int) -> bool:
-        """Whether it sees in the world's axes; of four learners of two widths each
+        """True if it sees in the world's axes; of four learners of two widths each
         width does both.
         """
         return (learner + learner // len(self.widths)) % 2 == 1
@@ -143,7 +143,7 @@ class PlannerSettings(PlanSettings):
     replan: Annotated[int, Interval("[1, 1000]")] = 10
     """Control steps after which it plans anew."""
     learned_value: bool = False
-    """Whether a second planner flies, to which the end of a plan is worth as many steps
+    """True if a second planner flies, to which the end of a plan is worth as many steps
     as the strongest of those that learned would be free from there, by its own
     estimate.
     """

@@ -71,7 +71,7 @@ INSTANCE = ("I", "C", "Instance")
 
 
 def is_dataflash(path: Path) -> bool:
-    """Whether a file starts like a DataFlash log."""
+    """True if a file starts like a DataFlash log."""
     if not path.is_file():
         return False
     with path.open("rb") as file:

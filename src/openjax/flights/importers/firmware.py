@@ -46,7 +46,7 @@ def firmware_columns(
 
 
 def are_duty_cycles(columns: dict[str, Source]) -> bool:
-    """Whether the motors' columns are what the firmware's motors got: duty cycles, behind
+    """True if the motors' columns are what the firmware's motors got: duty cycles, behind
     the battery compensation. The mixer's outputs are before it.
     """
     return columns.get("m1", Source("")).name in ("motor.m1", "pwm.m1_pwm")

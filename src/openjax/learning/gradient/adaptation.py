@@ -420,7 +420,7 @@ def fine_tune(
 
 
 def improves(first: Look, ahead: Look) -> bool:
-    """Whether a policy is clearly better, or clearly sooner and no worse.
+    """True if a policy is clearly better, or clearly sooner and no worse.
 
     In scores a crash is worth thousands of steps, and is rare: where a vehicle costs
     time alone, a thousand episodes' scores don't tell what is won from chance.
@@ -436,7 +436,7 @@ def clearly_better(
     scores: Float[np.ndarray, " episodes"],
     errors: float = 2.0,
 ) -> bool:
-    """Whether the scores (B,) of the same episodes rose by more than so many standard
+    """True if the scores (B,) of the same episodes rose by more than so many standard
     errors of their differences.
     """
     gain = np.asarray(scores, float) - np.asarray(first, float)

@@ -37,7 +37,7 @@ class EvaderKind:
     hiding: tuple[float, ...] = (0.0,)
     """A pursuer that wouldn't see it counts as this much farther (m)."""
     sees_all: tuple[bool, ...] = (True,)
-    """Whether it knows of all pursuers, or of those in its sight."""
+    """True if it knows of all pursuers, or of those in its sight."""
     acceleration: tuple[float, ...] = (UNBOUNDED,)
     """How fast its velocity changes at most where nothing is in its way (m/s^2)."""
     speed: tuple[float, ...] = (1.0,)

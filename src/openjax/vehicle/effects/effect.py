@@ -203,7 +203,7 @@ class Card:
     motors do unseen stay on their axis, so the replay alone tells these.
     """
     balanced: bool = False
-    """Whether the mean of its parameters belongs to another effect, and is held near
+    """True if the mean of its parameters belongs to another effect, and is held near
     zero.
     """
     others: tuple[tuple[float, ...], ...] = ()
@@ -213,19 +213,19 @@ class Card:
     others.
     """
     needs_force: bool = False
-    """Whether it can't be told without a force, of the path or of an accelerometer."""
+    """True if it can't be told without a force, of the path or of an accelerometer."""
     coordinate: str = ""
     """The variable that its force follows, for pictures; none where it makes torques or
     delays.
     """
     thrust_map: bool = False
-    """Whether a map from duty cycles to thrust that isn't known can imitate it."""
+    """True if a map from duty cycles to thrust that isn't known can imitate it."""
     scales_motion: bool = False
-    """Whether it can change all accelerations in proportion: of two such effects
+    """True if it can change all accelerations in proportion: of two such effects
     flights show the product alone, so that no set has both.
     """
     scales_torques: bool = False
-    """Whether it changes what thrust a motor command makes, and with it the gains of all
+    """True if it changes what thrust a motor command makes, and with it the gains of all
     torques, which are then no inertia's.
     """
     torque_axes: tuple[int, ...] = ()
@@ -247,9 +247,9 @@ class Card:
     nuisance_samples: Mapping[str, float] = field(default_factory=dict)
     """The same where motor commands are single samples, whose rows hide the rest."""
     weighed: bool = False
-    """Whether a weighed vehicle rules it out."""
+    """True if a weighed vehicle rules it out."""
     of_others: bool = False
-    """Whether it acts near other vehicles alone."""
+    """True if it acts near other vehicles alone."""
     at_voltage: Callable[[dict, dict, float], tuple[dict, dict]] | None = None
     """at_voltage(values, intervals, voltage): both as they are at one voltage, for
     simulators that know none.
@@ -335,7 +335,7 @@ class Effect:
     use one.
     """
     random: bool = False
-    """Whether `initial_memory` needs its key."""
+    """True if `initial_memory` needs its key."""
     formula: str = ""
     """What it changes, in LaTeX, for the documentation."""
     card: Card | None = None

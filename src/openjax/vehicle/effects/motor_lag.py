@@ -25,7 +25,7 @@ def body(parameters, vehicle):
 
 
 def lags(value, deviation):
-    """Whether motors lag. That they are early is what gusts look like, which the rate
+    """True if motors lag. That they are early is what gusts look like, which the rate
     controller answers, and single samples of the motors; a motor's time constant is
     known better than that.
     """

@@ -27,7 +27,7 @@ _SOURCE = "indoor draughts and fans, 0.3-3 m/s"
 
 
 def drags(value, deviation):
-    """Whether air that moves drags the vehicle along, along the rotors' axes too and not
+    """True if air that moves drags the vehicle along, along the rotors' axes too and not
     much more there, and rises no faster than draughts do or than a strong wind that is
     nearly level: a thrust that isn't known looks like a gale from below.
     """
