@@ -103,7 +103,7 @@ class _Diagnosed(NamedTuple):
 
 
 def _diagnose(effects: Path, airframe: str) -> _Diagnosed:
-    """What an effects file says."""
+    """The content of an effects file."""
     _, values = load_effects(effects)
     intervals = load_intervals(effects)
     family = adapted_family(values, intervals, airframe=airframe)

@@ -144,7 +144,7 @@ def draw_map(
 
 
 def _about(command, game, policy):
-    """What a map is of, and no cells yet."""
+    """A map's settings, without cells yet."""
     return {
         "policy": policy.source,
         "evaders": list(command.evaders),

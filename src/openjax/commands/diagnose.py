@@ -37,7 +37,7 @@ PROGRAM = "openjax diagnose"
 SECONDS = 5.0
 """Of a case on a laptop, about."""
 TOGETHER = "vehicles"
-"""What the report of several vehicles is called."""
+"""Name of the report of several vehicles."""
 _WITHOUT_HELP = f"Effects to leave out of the search, any of {', '.join(effect_names())}."
 
 
@@ -100,7 +100,7 @@ def run(options: Options) -> int:
 
 @dataclass(frozen=True)
 class Answer:
-    """What is kept of a case once its report is written."""
+    """The remains of a case once its report is written."""
 
     member: "Member"
     title: str
@@ -172,7 +172,7 @@ def _checked_names(options: Options) -> list[str]:
 
 
 def _outputs(options: Options, names: Sequence[str]) -> list[Path]:
-    """What is written into OUT."""
+    """The files to write into OUT."""
     together = [options.out / f"{TOGETHER}.json"] if len(names) > 1 else []
     return [*(options.out / name for name in names), *together]
 

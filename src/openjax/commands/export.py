@@ -38,7 +38,7 @@ EACH = (
     "active",
     "others_there",
 )
-"""What each pursuer sees for itself; the rest of an observation is the team's."""
+"""Fields that each pursuer sees for itself; the rest of an observation is the team's."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Arguments:
     out: Path = Path("exported")
     """Folder to write to."""
     observations: Annotated[int, Interval("[1, 100000000]")] = 10_000
-    """How many observations of its game it is compared on."""
+    """Number of observations of its game on which it is compared."""
     seed: Seed = 0
     """Draws those observations."""
 

@@ -149,7 +149,7 @@ def _fly(arguments: Arguments, preparation: Prepared | None) -> None:
 
 
 def _next(outcome) -> str:
-    """What can be done with a flight's log, in words."""
+    """The use of a flight's log, in words."""
     from openjax.flights.airborne import SHORTEST
 
     if outcome.longest >= SHORTEST:

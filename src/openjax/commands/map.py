@@ -26,7 +26,7 @@ ON_CPU = {
     "batch": 96,
     "best_response": False,
 }
-"""What is less by default without an accelerator: enough to see it work."""
+"""Smaller defaults without an accelerator: enough to see it work."""
 
 
 def main(arguments: Sequence[str]) -> int:

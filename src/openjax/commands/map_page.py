@@ -12,7 +12,7 @@ SHOWN = (
     *("num_pursuers", "speed_ratio", "capture_radius", "episodes", "capture_rate", "interval"),
     *("capture_seconds", "crash_rate", "forced_below", "planar_below", "planner"),
 )
-"""What a page has of a cell."""
+"""A page's record of a cell."""
 WHO = {
     "learned": "one that learned to escape from this team",
     "scripted": "one that flies by rules",

@@ -124,7 +124,7 @@ class MapCommand:
             learners=4, total_steps=400_000_000, looks=(), num_envs=1024, layouts=0.0
         )
     )
-    """How they learn; their tasks are the map's, and `layouts` counts for nothing."""
+    """Settings of their learning; tasks are the map's, and `layouts` has no effect."""
     planner_share: Annotated[float, Interval("[0, 1]")] = 0.1
     """Share of the cells in which an evader that plans flies, too."""
     planner_episodes: Annotated[int, Interval("[1, 1000000]")] = 50
@@ -190,7 +190,7 @@ class BenchmarkCommand:
     out to them.
     """
     parts: tuple[Part, ...] = PARTS
-    """What to measure."""
+    """Parts to measure."""
     steps: Annotated[int, Interval("[1, 100000]")] = 50
     """Control steps per call of physics, environment and rollout."""
     seconds: Annotated[float, Interval("(0, 3600]")] = 1.0

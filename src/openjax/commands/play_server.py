@@ -112,7 +112,7 @@ _END = object()
 
 
 class _Listener:
-    """How far a page has been told of the games."""
+    """A page's progress through the games."""
 
     def __init__(self, every: int):
         self.every = every

@@ -15,7 +15,7 @@ class MessageSettings:
     lost: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the messages that are lost, each on its own."""
     late: Annotated[float, Interval("[0, 10]")] = 0.0
-    """How late the others arrive (s)."""
+    """Delay of the others (s)."""
 
     def __post_init__(self):
         check_intervals(self, "messages.")

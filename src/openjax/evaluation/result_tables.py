@@ -20,7 +20,7 @@ FIELDS = (
     "over_speed_rate",
     "prediction_error",
 )
-"""What a record of an evaluation holds, in this order."""
+"""Fields of an evaluation's record, in this order."""
 
 
 def record_of(scenario: str, episodes: int, summary: dict, extra: tuple[str, ...] = ()) -> dict:

@@ -132,7 +132,7 @@ def _not_flown(vehicle_file: VehicleFile, logs_read) -> list[Issue]:
 
 
 def _held_instead(path: Path) -> str:
-    """What a folder without a log holds, in words, and what a log is."""
+    """A folder's content without a log, in words, and the known kinds of logs."""
     if (path / FLIGHT_FILE).exists():
         return f": openjax fly wrote it, and no game was flown; {FLIGHT_FILE} says why"
     others = sorted(file.name for file in path.iterdir() if file.name not in NO_LOGS)

@@ -143,7 +143,7 @@ def _least(row: float, rows: str) -> float:
 
 
 def _in_words(delays: dict[str, float]) -> str:
-    """How late each flight is."""
+    """The delay of each flight."""
     return ", ".join(
         f"{1e3 * abs(time):.0f} ms {'late' if time > 0 else 'early'} in {flight}"
         for flight, time in delays.items()

@@ -24,7 +24,7 @@ class Convention:
     """A way to write a log that isn't the log format's."""
 
     words: str
-    """What is the matter, and what would be right."""
+    """The mistake, and what would be right."""
     convert: Callable[[Signals], Signals]
     """The signals as they are in the log format's convention, if they were logged in
     this one.

@@ -34,7 +34,7 @@ class LogTable:
     vehicle: np.ndarray
     """(R,) ids."""
     remarks: tuple[str, ...] = field(default=())
-    """What was found while reading and doesn't stop it."""
+    """Remarks made while reading, which don't stop it."""
     duty_cycles: bool = False
     """True if the format says that m1 to m4 are duty cycles."""
     clock_start: float | None = None

@@ -31,7 +31,7 @@ class Segment:
 
     seconds: float
     shows: str
-    """What it is, in words."""
+    """Its description, in words."""
     path: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
     """path(t, ease): position (T, 3) m and yaw (T,) rad."""
     commands: Callable[[np.ndarray], np.ndarray] | None = None

@@ -7,7 +7,7 @@ from time import sleep
 from openjax.flying.set_point import OFF, SetPoint, manual_arguments
 
 BOOT = {"udp": 0.2, "radio": 5.0}
-"""How long a restarted vehicle takes until it answers (s)."""
+"""Time that a restarted vehicle takes to answer (s)."""
 
 
 def send_set_point(crazyflie, set_point: SetPoint) -> None:

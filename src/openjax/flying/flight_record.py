@@ -1,4 +1,4 @@
-"""What happened at every tick of a flight, and how well it was on time."""
+"""The record of every tick of a flight, and of how punctual it was."""
 
 from array import array
 from collections.abc import Callable
@@ -26,7 +26,7 @@ class GameNotes:
     over_speed: int = 0
     """Steps in which a pursuer was faster than the game allows."""
     draws: tuple[float, ...] = ()
-    """What the team drew for it, see `openjax.flying.game.Play`."""
+    """The strategies that the team drew for it, see `openjax.flying.game.Play`."""
 
     def count(self, play, is_too_fast: bool) -> None:
         """Add a step, see `openjax.flying.game.Play`."""

@@ -3,7 +3,7 @@
 import math
 
 DRIFT = 5e-5
-"""How fast two clocks may part (s/s): quartzes are good to some tens of ppm."""
+"""Largest relative drift of two clocks (s/s): quartzes are good to some tens of ppm."""
 _WRAP = 1 << 24
 """Milliseconds after which a time stamp of three bytes begins again."""
 

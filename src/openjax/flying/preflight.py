@@ -11,7 +11,7 @@ from openjax.flying.member import PERIOD_MS
 from openjax.flying.state import PoseSample, State
 
 LISTENING = 0.5
-"""How long (s) links are listened to, to count poses."""
+"""Time (s) for which poses are counted."""
 READING = 0.02
 """After so long (s) they're read: some 270 poses fit into what leads here, a third of a
 second of eight vehicles, and those that find it full are lost.

@@ -19,7 +19,7 @@ _ATOM = 4096
 
 
 class Kind(IntEnum):
-    """What a record tells; its number is a vehicle's or a game's."""
+    """The kind of a record; its number is a vehicle's or a game's."""
 
     POSES = 0
     BODIES = 1

@@ -43,13 +43,13 @@ class NewCase(NamedTuple):
 
     folder: Path
     files: dict[str, bytes]
-    """What is in it from the start, by name."""
+    """Its content from the start, by name."""
     about: dict
-    """What flight.json says beside timing and games."""
+    """Content of flight.json beside timing and games."""
 
 
 class Outcome(NamedTuple):
-    """What became of a log."""
+    """The fate of a log."""
 
     folder: Path | None = None
     """None: there is no log."""

@@ -79,7 +79,7 @@ class SafetySettings:
     lift_time: Annotated[float, Interval("(0, 60]")] = 2.0
     """The test lift must be done within this time (s)."""
     hold_time: Annotated[float, Interval("[0, 600]")] = 0.5
-    """How long vehicles wait after a trouble before they land (s)."""
+    """Time that vehicles wait after a trouble before they land (s)."""
     transfer_speed: Annotated[float, Interval("(0, 10]")] = 0.5
     """Speed on the way to the start (m/s)."""
     landing_speed: Annotated[float, Interval("(0, 10]")] = 0.4

@@ -35,7 +35,7 @@ degrees.
 
 
 class Trials(NamedTuple):
-    """What came of the plans of B worlds."""
+    """The outcome of the plans of B worlds."""
 
     plans: Plans
     promise: Float[Array, "worlds plans"]

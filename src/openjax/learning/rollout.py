@@ -57,7 +57,7 @@ class Players:
 
 @struct.dataclass
 class Noise:
-    """What a rollout's exploration draws, standard normal, ahead in one go."""
+    """The exploration noise of a rollout, standard normal, drawn ahead in one go."""
 
     pursuers: jax.Array  # (T, E, N, A)
     evaders: jax.Array | None = None  # (T / hold, E, 3)

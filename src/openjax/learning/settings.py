@@ -333,7 +333,7 @@ class PlanSettings:
 
 @dataclass(frozen=True)
 class AdaptSettings:
-    """How a policy is fine-tuned."""
+    """Settings of fine-tuning a policy."""
 
     worlds: Annotated[int | None, Interval("[1, 65536]")] = None
     """Worlds of each kind of flight in an update; by default 320 on an accelerator, 8

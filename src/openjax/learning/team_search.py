@@ -106,7 +106,7 @@ class Points:
 
 @dataclass(frozen=True)
 class TeamSearch:
-    """How many plans a team tries, and how far they reach."""
+    """The number of plans that a team tries, and their reach."""
 
     game: PursuitSettings
     plans: int = 48

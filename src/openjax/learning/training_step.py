@@ -53,7 +53,7 @@ class TrainCarry:
 
 @dataclass(frozen=True)
 class Parts:
-    """What a training step is made of. Each part may be one's own."""
+    """The parts of a training step. Each may be your own."""
 
     environment: Pursuit
     policy: Policy
@@ -233,7 +233,7 @@ def make_training_step(
 
 @dataclass(frozen=True)
 class _Step:
-    """What the phases have in common."""
+    """The common ground of the phases."""
 
     settings: TrainSettings
     parts: Parts

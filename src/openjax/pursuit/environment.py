@@ -142,7 +142,7 @@ class Pursuit:
     reward: tuple[Term, ...] | None = None
     """The reward's terms; None: `openjax.pursuit.default_reward(settings.reward)`."""
     observer: Observer | None = None
-    """What pursuers observe; None: `openjax.pursuit.observe`."""
+    """The pursuers' observation; None: `openjax.pursuit.observe`."""
 
     def __post_init__(self):
         settings = self.settings or PursuitSettings()

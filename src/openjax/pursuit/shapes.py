@@ -34,4 +34,4 @@ Quaternions = Float[Array, "drones 4"]
 Actions = Float[Array, "drones 4"]
 """Collective thrust, roll, pitch and yaw rate, in -1..1."""
 Memory = Float[Array, "memory"]
-"""What an evader remembers, as numbers."""
+"""An evader's memory, as numbers."""

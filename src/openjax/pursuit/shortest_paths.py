@@ -23,7 +23,7 @@ shares of crashes and breaches that a first flight counts early cost more than a
 through saves: pursuers then stand before it.
 """
 TOLL = 3.0
-"""What a path through a pillar costs (m): more than any path round."""
+"""Cost of a path through a pillar (m): more than any path round."""
 POINTS = 40
 """Of the arena at which is asked who is there first: one for each 6 dm²."""
 SMOOTH = 0.1

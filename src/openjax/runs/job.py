@@ -59,11 +59,11 @@ class TrainingJob:
     """The training to do, and its conditions."""
 
     command: TrainCommand
-    """What was asked for, with what the machine or a resumed run adds to it."""
+    """The request, with what the machine or a resumed run adds to it."""
     parts: Parts
     """Environment, policy and learners."""
     own_parts: OwnParts
-    """What was handed in from Python."""
+    """The parts that were given in Python."""
     devices: int
     """Of all processes together."""
     processes: Processes

@@ -67,7 +67,7 @@ class TrainingStep:
 
 @dataclasses.dataclass(frozen=True)
 class Programs:
-    """What a run compiles."""
+    """The programs that a run compiles."""
 
     carry: TrainCarry
     """Shapes, dtypes and places of the carry's leaves."""

@@ -111,7 +111,7 @@ def _draw(directory, flights, other_flights):
 
 
 _KINDS = {"validation": "new tasks", "validation_far": "far starts"}
-"""What the rows that aren't layouts are called."""
+"""Names of the rows that aren't layouts."""
 
 
 def before_after_table(

@@ -53,7 +53,7 @@ class Run:
 
 @dataclasses.dataclass(frozen=True)
 class RunState:
-    """How far a run has come before its updates go on."""
+    """The progress of a run before its updates go on."""
 
     carry: TrainCarry
     update: int
@@ -165,7 +165,7 @@ def learn(run: Run, state: RunState) -> Outcome:
 
 
 def _plan(run, state):
-    """What is left to do from now on."""
+    """The steps that are left to do."""
     settings = run.job.settings
     return Plan(
         total_updates=settings.total_updates,

@@ -86,14 +86,14 @@ def closing_words(
 
 
 def how_to_go_on(checkpoints: Checkpoints, directory: RunDirectory) -> str:
-    """What there is of a run, and how it goes on, should it end now."""
+    """The state of a run that ends now, and the command that continues it."""
     update = checkpoints.last_finished()
     words = "nothing was learnt yet" if update is None else f"saved at update {update}"
     return f"{words}; go on with {as_typed(f'openjax train --resume {directory.path}')}"
 
 
 def first_flights_words(summary: dict) -> str:
-    """What the stage before MAPPO taught, by its validation."""
+    """The result of the stage before MAPPO, by its validation."""
     return (
         f"the first flights alone catch {summary['capture_rate']:.0%} of the validation tasks and "
         f"crash in {summary['crash_rate']:.0%}; MAPPO goes on from there"

@@ -18,7 +18,7 @@ from openjax.store.run_directory import RunDirectory, is_run
 
 @dataclasses.dataclass(frozen=True)
 class Draws:
-    """How a team draws one of its policies."""
+    """The way in which a team draws one of its policies."""
 
     seconds: float = 0.4
     """Time after which it draws again (s); 0: it draws once an episode."""

@@ -69,7 +69,7 @@ class LoadedPolicy:
     policy: Policy | Heuristic | OwnController
     parameters: PolicyParameters
     settings: TrainSettings
-    """What it was trained with; of a heuristic, the game's defaults."""
+    """The settings of its training; of a heuristic, the game's defaults."""
     source: str
     environment: Pursuit | None = None
     """Its game, where that has parts of one's own; None: the one that the settings

@@ -30,7 +30,7 @@ Three = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class _Numbers:
-    """What a vehicle's MJCF holds, and in which range."""
+    """The content of a vehicle's MJCF, with its ranges."""
 
     mass: Annotated[float, Interval("[0.005, 10]", "kg")]
     """As in a vehicle.toml."""
@@ -57,7 +57,7 @@ _CUSTOM = {
     "rate_kd": 3,
     "rate_integral_limit": 3,
 }
-"""What an MJCF has in `<custom>`, and how many values."""
+"""Entries of an MJCF's `<custom>`, with their number of values."""
 
 
 @lru_cache(maxsize=8)

@@ -16,7 +16,7 @@ CALIBRATED_UNITS = MappingProxyType({
     "motor_time_constant": "s",
     "inertia": "kg m^2",
 })  # fmt: skip
-"""What a calibration may hold."""
+"""Quantities that a calibration may hold."""
 
 Place = Literal[*NOMINAL_ORDER]
 Spin = Literal["cw", "ccw"]

@@ -213,7 +213,7 @@ class VirtualFirmware:
         return [] if answer is None else [packet._replace(data=bytes([command | 0x80]) + answer)]
 
     def _memory(self, packet, time):
-        """How many memories there are: none."""
+        """The number of memories: none."""
         if packet.channel == 0 and packet.data[0] == 1:
             return [packet._replace(data=b"\x01\x00")]
         return []

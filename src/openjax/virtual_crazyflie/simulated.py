@@ -78,7 +78,7 @@ class SimulatedSwarm:
         self._look()
 
     def observe(self) -> tuple[PoseSample, ...]:
-        """What is known of each vehicle now."""
+        """The present knowledge of each vehicle."""
         return tuple(self._samples)
 
     def send(self, set_points: Sequence[SetPoint | None]) -> None:

@@ -168,7 +168,7 @@ class VirtualVehicles:
         return self._voltage
 
     def sensors(self, i: int) -> Sensors:
-        """What vehicle i senses."""
+        """The sensors' readings of vehicle i."""
         report = self.report
         return Sensors(
             position=report.position[i],

@@ -168,7 +168,7 @@ class Adaptation:
         return clipped_descent(falling_rate(self.settings.learning_rate, self.settings.updates))
 
     def flight(self, bounds: Bounds) -> SmoothFlight:
-        """How vehicles of the bounds fly while a gradient is taken."""
+        """The flights of vehicles at the bounds, for a gradient."""
         return SmoothFlight(self.free.with_bounds(bounds), self.policy)
 
     def begin(self, key: PRNGKeyArray) -> tuple:
@@ -370,14 +370,14 @@ class Look:
     """A policy's episodes, of the same tasks and vehicles each time."""
 
     scores: Float[np.ndarray, " episodes"]
-    """What is to be large."""
+    """The objective, to be maximised."""
     steps: Float[np.ndarray, " episodes"]
     """Control steps to the capture."""
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """What fine-tuning led to."""
+    """The result of fine-tuning."""
 
     parameters: PolicyParameters
     """The best of those looked at, the first ones among them; without a critic."""

@@ -61,7 +61,7 @@ def first_game(environment: Pursuit, stage: FirstFlightsSettings) -> Pursuit:
 
 @struct.dataclass
 class FirstWorlds:
-    """What the lesson carries from update to update."""
+    """The lesson's state between two updates."""
 
     world: Any  # (B, ...)
     ramp: jax.Array
@@ -78,7 +78,7 @@ class FirstFlights:
     flight: SmoothFlight
     """In the `first_game`."""
     tasks: GeneratorSettings = field(default_factory=GeneratorSettings)
-    """How the generator's uniform tasks differ from the paper's; these do, too."""
+    """The generator's differences from the paper's uniform tasks; these have them, too."""
     axis: str | None = None
     """Of the devices, where there are several."""
 

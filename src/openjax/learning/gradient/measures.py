@@ -219,7 +219,7 @@ class Encounter(NamedTuple):
 
 
 def no_encounter(shape: tuple[int, int]) -> Encounter:
-    """What pursuers (B, N) have met before the first step."""
+    """The contacts of pursuers (B, N) before the first step."""
     zeros = jnp.zeros(shape)
     of_worlds = jnp.zeros(shape[0])
     return Encounter(

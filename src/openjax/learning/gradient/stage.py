@@ -29,7 +29,7 @@ MOST_NORM = 1.0
 
 @struct.dataclass
 class StageCarry:
-    """What a stage is between two updates."""
+    """The state of a stage between two updates."""
 
     actor: TrainState
     lesson: Any
@@ -37,7 +37,7 @@ class StageCarry:
 
 
 class Turn(NamedTuple):
-    """What an update begins with."""
+    """The input of an update."""
 
     carry: StageCarry
     parameters: PolicyParameters
@@ -53,22 +53,22 @@ class Turn(NamedTuple):
 
 
 class Learnt(NamedTuple):
-    """What comes of an update."""
+    """The output of an update."""
 
     gradient: Any
     """The actor's."""
     lesson: Any
-    """What the next update begins with, see `Lesson.begin`."""
+    """The input of the next update, see `Lesson.begin`."""
     parts: Mapping[str, Scalar]
     """Of the loss."""
 
 
 class Lesson(Protocol):
-    """What a stage teaches, and how large its steps are."""
+    """The lesson of a stage, and its step size."""
 
     @property
     def updates(self) -> int:
-        """How many there are."""
+        """Their number."""
 
     @property
     def optimiser(self) -> optax.GradientTransformation:

@@ -69,7 +69,7 @@ NEAR = 0.05
 
 @struct.dataclass
 class PlannedWorlds:
-    """What the lesson carries from update to update."""
+    """The lesson's state between two updates."""
 
     world: Any
     """Observations and states (B, ...)"""
@@ -103,7 +103,7 @@ class WorstPlans:
     """See `planning_game`."""
     usual: LastFlights
     tasks: GeneratorSettings
-    """How the generator's uniform tasks differ from the paper's; these do, too."""
+    """The generator's differences from the paper's uniform tasks; these have them, too."""
 
     @property
     def updates(self) -> int:

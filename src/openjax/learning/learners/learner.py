@@ -1,4 +1,4 @@
-"""What a learner is, and what it learns from."""
+"""A learner, and the samples that it learns from."""
 
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable

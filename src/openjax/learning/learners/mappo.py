@@ -147,7 +147,7 @@ def loss(
 
 
 class Estimates(NamedTuple):
-    """What the critic makes of a rollout of T steps in E worlds."""
+    """The critic's values of a rollout of T steps in E worlds."""
 
     advantage: jax.Array  # (T, E, N)
     returns: jax.Array  # (T, E, N)
@@ -156,7 +156,7 @@ class Estimates(NamedTuple):
 
 @struct.dataclass
 class MappoState:
-    """What MAPPO is between two updates, beside the policy's parameters."""
+    """The state of MAPPO between two updates, beside the policy's parameters."""
 
     actor: Any
     """State of the actor's optimiser."""

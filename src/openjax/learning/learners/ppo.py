@@ -22,17 +22,17 @@ Mean = Callable[[jax.Array], jax.Array]
 
 @struct.dataclass
 class Samples:
-    """What is learnt from; leading axes alike."""
+    """The samples to learn from, with the same leading axes."""
 
     inputs: Any
-    """What the networks are asked about: what was seen, and what was done."""
+    """The inputs of the networks: observations and actions."""
     log_prob: jax.Array  # (...) of what was done, by the networks that did it
     advantage: jax.Array  # (...) of mean zero and standard deviation one
     target: jax.Array  # (...) of the values
 
 
 class Answer(NamedTuple):
-    """What the networks that learn say of samples."""
+    """The outputs of the learning networks for samples."""
 
     log_prob: jax.Array  # (...) of what was done
     value: jax.Array  # (...)
@@ -41,7 +41,7 @@ class Answer(NamedTuple):
 
 
 class Terms(NamedTuple):
-    """What the loss is the sum of, and the ratio of probabilities behind it."""
+    """The terms of the loss, and their ratio of probabilities."""
 
     policy_loss: jax.Array
     value_loss: jax.Array
@@ -51,7 +51,7 @@ class Terms(NamedTuple):
 
 @dataclass(frozen=True)
 class Objective:
-    """What gradient steps minimise."""
+    """The loss that gradient steps minimise."""
 
     mean: Mean
     clip: jax.Array | float

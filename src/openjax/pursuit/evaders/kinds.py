@@ -90,7 +90,7 @@ HELD_OUT = _of("held out")
 
 
 Evader = str | EvaderKind | Callable[[Any, Any], tuple[Any, Any]]
-"""What may be handed in as an evader: a name, a row, or a row's behaviour alone."""
+"""An evader as it may be given: a name, a row, or a row's behaviour alone."""
 
 
 def evader_rows(

@@ -281,7 +281,7 @@ class Card:
     like, by which share each rotor seems to push more.
     """
     next_flight: str = ""
-    """What flight would show it, in words."""
+    """The flight that would show it, in words."""
 
 
 # Hooks of one drone; `parameters` is {name: () array}, `memory` a pytree of arrays.
@@ -337,7 +337,7 @@ class Effect:
     random: bool = False
     """True if `initial_memory` needs its key."""
     formula: str = ""
-    """What it changes, in LaTeX, for the documentation."""
+    """Its formula in LaTeX, for the documentation."""
     card: Card | None = None
     """How the diagnosis tells it; without one it can be flown with, but not be
     diagnosed.
