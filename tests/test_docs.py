@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import openjax
 from openjax.__main__ import COMMANDS
 from openjax.vehicle.effects import EFFECTS
 
@@ -122,6 +123,13 @@ def test_notebooks_are_made_from_the_tutorials():
         for cell in code[1:]:
             ast.parse("".join(cell["source"]))
             assert "".join(cell["source"]) in page
+
+
+def test_the_release_reads_the_version_where_it_is_written():
+    workflow = (ROOT / ".github" / "workflows" / "release.yml").read_text(encoding="utf-8")
+    (path,) = re.findall(r"(src/openjax/\S+\.py)\)", workflow)
+    (version,) = re.findall(r'^__version__ = "(.*)"$', (ROOT / path).read_text("utf-8"), re.M)
+    assert version == openjax.__version__
 
 
 def test_page_of_the_effects_has_them_all():
