@@ -40,7 +40,7 @@ TINY = TrainSettings(
     ),
     network=NetworkSettings(features=8, heads=1),
     predictor=PredictorSettings(enabled=False),
-    mappo=MappoSettings(minibatches=2, epochs=1),
+    mappo=MappoSettings(minibatches=2),
     generator=GeneratorSettings(capacity=8, episodes_per_task=2),
     num_envs=8,
     rollout_length=4,

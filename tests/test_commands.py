@@ -37,9 +37,9 @@ TINY = (
     "--environment.time_step 0.01 --environment.substeps 1 "
     "--network.features 8 --network.heads 1 --network.critic_encoder layers "
     "--predictor.units 4 --predictor.windows 4 --predictor.steps 2 --predictor.horizons 1 2 "
-    "--mappo.minibatches 2 --mappo.epochs 1 --generator.capacity 8 "
+    "--mappo.minibatches 2 --generator.capacity 8 "
     "--validation_interval 3 --validation_episodes 4 "
-    "--first_flights.updates 1 --first_flights.worlds 4 --first_flights.steps 2"
+    "--first_flights.updates 1"
 ).split()
 STEPS = ["--steps", str(UPDATES * 160), "--layout_episodes", "4"]
 ALONE = ["--compare_with", "none"]
@@ -205,7 +205,7 @@ def test_signal_before_the_first_update_ends_at_once_and_loses_nothing(
 
 
 LAST_STAGE = ["--analytic.updates", "3", "--analytic.look_every", "1"]
-LAST_STAGE += ["--analytic.worlds", "2", "--analytic.draws", "1"]
+LAST_STAGE += ["--analytic.worlds", "2"]
 
 
 @pytest.fixture(scope="session")
@@ -405,7 +405,7 @@ def wrong_layout(change):
             "--environment.pillar_radius 5",
             "leaves no room in an arena of radius 0.9: less than 0.83",
         ),
-        (train, "--mappo.epochs two", "--mappo.epochs is 'two'; expected a whole number"),
+        (train, "--mappo.minibatches two", "--mappo.minibatches is 'two'; expected a whole number"),
         (train, "--network.heads 0", "network.heads is 0; it must be a whole number in"),
         (train, "--mappo.learning_rate nan", "mappo.learning_rate is nan; it must be in (0, 1]"),
         (train, "--restart_close 0.5", "restart_close 0.5 needs restart_every"),

@@ -18,7 +18,7 @@ FUNCTION = {"lines": 40, "branches": 10, "arguments": 5}
 """The most of a function: lines without its docstring, branches and arguments without
 those of functions inside it.
 """
-OVER = {"lines": 36, "branches": 8, "arguments": 48}
+OVER = {"lines": 33, "branches": 8, "arguments": 48}
 """Functions that are still over each limit; too many branches have some of `flights`,
 `gap` and the experiments alone.
 """

@@ -89,7 +89,6 @@ def fly_finely(loaded: LoadedPolicy) -> dict[str, float]:
             substeps=1,
             episode_length=own.episode_length * substeps,
             history_spacing=own.history_spacing * substeps,
-            observe_history_spacing=own.observe_history_spacing * substeps,
         )
     )
     tasks = uniform_tasks(own, loaded.settings.validation_episodes, own.max_pillars)

@@ -114,7 +114,8 @@ def _dataclass_from_plain(kind, value, place):
 
 def _was_setting(kind, key, entries, place):
     """True if earlier versions had this setting, which is a constant of the class now: of the
-    same name in capitals, or in its `FORMER` where the code doesn't need it.
+    same name in capitals, or in its `FORMER` where the code doesn't need it, a set if it had
+    several values.
 
     Raises:
       UserError: it has another value, in a part that isn't switched off (`SWITCH` names the
@@ -126,12 +127,16 @@ def _was_setting(kind, key, entries, place):
     if key not in constants:
         return False
     constant = constants[key]
+    values = constant if isinstance(constant, set) else {constant}
     is_off = switch is not None and entries.get(switch) == 0
-    value = entries[key]
-    if not is_off and (isinstance(value, bool) != isinstance(constant, bool) or value != constant):
+    value = tuple(entries[key]) if isinstance(entries[key], list) else entries[key]
+    is_known = any(
+        value == one and isinstance(value, bool) == isinstance(one, bool) for one in values
+    )
+    if not is_off and not is_known:
         raise UserError(
             f"{_place(place, key)} is {shown(value)}; it is no longer a setting and is always "
-            f"{constant}"
+            f"{' or '.join(map(str, sorted(values)))}"
         )
     return True
 

@@ -73,7 +73,7 @@ def test_a_policy_for_teams_flies_with_any_number(tmp_path, capsys):
     game = dict(physics="rigid", contacts=False, episode_length=5, evaders=("field",), substeps=1)
     small = dict(
         network=dict(features=8),
-        predictor=dict(units=4, horizons=(1, 2), windows=2, steps=1),
+        predictor=dict(units=4, horizons=(1, 2), windows=2),
         mappo=dict(step_subsampling=1),
         rollout_length=5,
         restart_steps=5,

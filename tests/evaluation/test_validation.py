@@ -60,7 +60,7 @@ def test_uniform_tasks_fly_as_they_would_alone():
     run = TrainSettings(
         environment=game,
         network=NetworkSettings(features=8, heads=2),
-        predictor=PredictorSettings(units=4, windows=1, steps=1, horizons=(1, 2)),
+        predictor=PredictorSettings(units=4, windows=2, horizons=(1, 2)),
         rollout_length=3,
         restart_steps=3,
         validation_episodes=4,

@@ -19,8 +19,8 @@ pytestmark = pytest.mark.slow
 TINY = TrainSettings(
     environment=PursuitSettings(episode_length=12, physics="rigid", history_length=3),
     network=NetworkSettings(features=8, heads=2),
-    predictor=PredictorSettings(units=4, windows=2, steps=1, horizons=(1, 2)),
-    mappo=MappoSettings(minibatches=2, epochs=1),
+    predictor=PredictorSettings(units=4, windows=2, horizons=(1, 2)),
+    mappo=MappoSettings(minibatches=2),
     generator=GeneratorSettings(capacity=8, episodes_per_task=2),
     num_envs=12,
     rollout_length=4,

@@ -2,8 +2,6 @@
 flies what in a world.
 """
 
-import dataclasses
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -24,7 +22,17 @@ WORLDS = 256
 ENVIRONMENT = make(
     evaders=("field", "learned", "greedy", "learned"), physics="stops", max_pillars=5
 )
-HOW = EvaderLearningSettings(epochs=4, learning_rate=3e-3, initial_log_std=0.0)
+
+
+class Fast(EvaderLearningSettings):
+    """Learns in a few updates."""
+
+    EPOCHS = 4
+    LEARNING_RATE = 3e-3
+    INITIAL_LOG_STD = 0.0
+
+
+HOW = Fast()
 LEARNING = EvaderLearner(HOW, ENVIRONMENT, updates=1)
 PURSUERS = PolicyParameters(actor={}, critic={}, predictor={})
 act = jax.jit(LEARNING.act)
@@ -197,8 +205,12 @@ def test_earlier_selves_fly_and_learn_nothing(worlds):
     """Of two learned evaders the second is an earlier self: its samples change nobody,
     and it becomes what the first was when it was drawn.
     """
-    how = dataclasses.replace(HOW, past=1, pool=2, pool_every=1)
-    learning = EvaderLearner(how, ENVIRONMENT, updates=4)
+
+    class Forgetful(Fast):
+        POOL = 2
+        POOL_EVERY = 1
+
+    learning = EvaderLearner(Forgetful(past=1), ENVIRONMENT, updates=4)
     start = jax.jit(learning.start)(PURSUERS, jax.random.key(1))
 
     @jax.jit

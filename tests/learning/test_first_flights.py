@@ -26,6 +26,15 @@ from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings
 from openjax.pursuit.shortest_paths import shortest_paths
 
+
+class Small(FirstFlightsSettings):
+    """Few short worlds."""
+
+    WORLDS = 4
+    STEPS = 2
+    ANEW = 0.5
+
+
 GAME = PursuitSettings(
     physics="rigid",
     num_pursuers=2,
@@ -41,7 +50,7 @@ def test_a_second_of_the_stage_is_a_second_of_the_game():
     for name in ("quick", "paper", "flight"):
         game = preset(name).environment
         own = first_game(Pursuit(game), how).settings
-        assert own.time_step == pytest.approx(how.time_step)
+        assert own.time_step == pytest.approx(how.TIME_STEP)
         assert own.episode_length * own.time_step == pytest.approx(
             game.episode_length * game.time_step
         )
@@ -50,7 +59,11 @@ def test_a_second_of_the_stage_is_a_second_of_the_game():
 
 @pytest.mark.slow
 def test_pursuers_come_nearer():
-    how = FirstFlightsSettings(updates=160, worlds=48, learning_rate=5e-3)
+    class Fast(FirstFlightsSettings):
+        WORLDS = 48
+        LEARNING_RATE = 5e-3
+
+    how = Fast(updates=160)
     environment = first_game(Pursuit(GAME), how)
     policy = Policy.for_environment(
         environment,
@@ -73,7 +86,7 @@ def test_pursuers_come_nearer():
 
 
 def test_a_game_without_pillars_can_be_learnt():
-    how = FirstFlightsSettings(updates=1, worlds=2, steps=2)
+    how = Small(updates=1)
     environment = first_game(Pursuit(dataclasses.replace(GAME, max_pillars=0)), how)
     networks = NetworkSettings(features=8, heads=1), PredictorSettings(enabled=False)
     flight = SmoothFlight(environment, Policy.for_environment(environment, *networks))
@@ -88,7 +101,7 @@ def test_a_game_without_pillars_can_be_learnt():
 
 @pytest.mark.slow
 def test_two_devices_learn_what_one_does():
-    how = FirstFlightsSettings(updates=2, worlds=4, steps=2, anew=0.5)
+    how = Small(updates=2)
     environment = first_game(Pursuit(GAME), how)
     networks = NetworkSettings(features=8, heads=1), PredictorSettings(enabled=False)
     flight = SmoothFlight(environment, Policy.for_environment(environment, *networks))

@@ -22,12 +22,21 @@ def test_a_former_setting_with_its_constants_value_is_ignored():
     plain["environment"]["evader_norm"] = "euclidean"
     plain["environment"]["reward"]["territory"] = 0
     plain["predictor"]["decay"] = True
+    plain["evaders_validation"] = ["field", "heavy", "pillar_hugger"]
+    # weights for teams of eight, and any of a stage that isn't there
+    plain["analytic"]["breach"] = 5.3
+    plain["first_flights"]["steps"] = 15
     assert from_plain(TrainSettings, plain) == TrainSettings()
 
 
 @pytest.mark.parametrize(
     ("group", "name", "value"),
-    [("mappo", "huber", 5.0), ("predictor", "loss", "squared"), ("predictor", "decay", 1)],
+    [
+        ("mappo", "huber", 5.0),
+        ("predictor", "loss", "squared"),
+        ("predictor", "decay", 1),
+        ("analytic", "speed", 2.0),
+    ],
 )
 def test_a_former_setting_with_another_value_is_one_line(group, name, value):
     with pytest.raises(UserError, match=f"{group}.{name} is .* it is no longer a setting and"):

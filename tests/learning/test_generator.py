@@ -9,13 +9,19 @@ import numpy as np
 import pytest
 
 from openjax.learning.archive import empty_archive
-from openjax.learning.generator import generate_task, select, successes, task_like
+from openjax.learning.generator import (
+    generate_task,
+    select,
+    successes,
+    task_like,
+    vary_pillars,
+)
 from openjax.learning.settings import GeneratorSettings
-from openjax.pursuit import Pursuit, PursuitSettings, Task, empty_task
+from openjax.pursuit import Pursuit, PursuitSettings, Task, empty_task, uniform_task
 from openjax.pursuit.statistics import empty_statistics
 
 GAME = PursuitSettings()
-NOMINAL = GeneratorSettings(capacity=8, turn=False)
+NOMINAL = GeneratorSettings(capacity=8)
 KEYS = jax.random.split(jax.random.key(0), 1000)
 
 
@@ -28,6 +34,14 @@ def generate(settings):
 
 def generated(settings, archive):
     return generate(settings)(archive, KEYS)
+
+
+def gaps(tasks):
+    """(T, N) m on the level between pursuers, who start beyond .1 m on one side, and the
+    evader, which does on the other.
+    """
+    away = tasks.pursuer_position - tasks.evader_position[:, None]
+    return np.linalg.norm(np.asarray(away)[..., :2], axis=-1)
 
 
 def archived():
@@ -51,7 +65,7 @@ def test_uniform_tasks_without_archived_ones(switch):
         tasks = generated(NOMINAL, empty_archive(empty_task(GAME), 8))
     else:
         tasks = generated(dataclasses.replace(NOMINAL, enabled=False), archived()[0])
-    assert tasks.pursuer_position[..., 0].min() >= 0.1 and tasks.evader_position[:, 0].max() <= -0.1
+    assert gaps(tasks).min() >= 0.2
     assert set(np.asarray(tasks.pillar_active.sum(axis=1))) == {4, 5}
 
 
@@ -63,7 +77,7 @@ def test_archived_tasks_are_expanded_with_probability_p():
     moved = np.asarray(tasks.pursuer_position)[local] - np.asarray(parent.pursuer_position)
     assert np.abs(moved).max() <= 0.1 + 1e-6 and np.abs(moved).max(axis=(1, 2)).min() > 0
     np.testing.assert_array_equal(np.asarray(tasks.pillar_position)[local][:, 0], np.float32(0.05))
-    assert (np.asarray(tasks.pursuer_position)[~local][..., 0] >= 0.1).all()
+    assert gaps(tasks)[~local].min() >= 0.2
 
 
 def test_a_task_keeps_its_evader():
@@ -81,7 +95,7 @@ def test_a_task_keeps_its_evader():
 
 
 def test_turned_uniform_tasks_come_from_all_sides():
-    tasks = generated(GeneratorSettings(capacity=8), empty_archive(empty_task(GAME), 8))
+    tasks = generated(NOMINAL, empty_archive(empty_task(GAME), 8))
     angle = np.arctan2(tasks.evader_position[:, 1], tasks.evader_position[:, 0])
     assert np.histogram(angle, 4, (-np.pi, np.pi))[0].min() > 150
 
@@ -91,13 +105,16 @@ def test_a_share_of_uniform_tasks_has_its_pillars_in_a_row():
     plain = generated(NOMINAL, empty_archive(empty_task(GAME), 8))
     varied = generated(rows, empty_archive(empty_task(GAME), 8))
     np.testing.assert_array_equal(varied.pursuer_position, plain.pursuer_position)
-    changed = np.asarray(varied.pillar_position != plain.pillar_position).any(axis=(1, 2))
+    moved = np.abs(np.asarray(varied.pillar_position - plain.pillar_position))
+    changed = (moved > 1e-4).any(axis=(1, 2))
     np.testing.assert_allclose(changed.mean(), 0.25, atol=0.05)
-    shifted = generated(
-        dataclasses.replace(NOMINAL, pillar_shift=0.05), empty_archive(empty_task(GAME), 8)
-    )
-    moved = np.asarray(shifted.pillar_position - plain.pillar_position)
-    assert 0.04 < np.abs(moved).max() <= 0.05 + 1e-6
+
+
+def test_pillars_of_uniform_tasks_are_moved_off_the_grid():
+    on_grid = jax.jit(jax.vmap(functools.partial(uniform_task, GAME)))(KEYS)
+    shifted = jax.jit(jax.vmap(functools.partial(vary_pillars, NOMINAL, GAME)))(KEYS, on_grid)
+    moved = np.asarray(shifted.pillar_position - on_grid.pillar_position)
+    assert 0.08 < np.abs(moved).max() <= NOMINAL.PILLAR_SHIFT + 1e-6
 
 
 def test_unsolved_tasks_of_whole_episodes_enter():

@@ -104,7 +104,7 @@ def test_hard_starts_are_those_that_come_nearest(stage):
         met = gradient.flight.fly(parameters.actor, parameters, starts, gradient.steps)[1]
         return met.least.min(-1)
 
-    bounds = jnp.concatenate([gradient.bounds()] * gradient.settings.draws)
+    bounds = jnp.concatenate([gradient.bounds()] * gradient.settings.DRAWS)
     all_of_them = np.sort(least(gradient.starts(key, bounds)))
     hard = np.sort(least(jax.jit(gradient.hard_starts)(parameters.actor, parameters, key)))
     np.testing.assert_allclose(hard, all_of_them[: gradient.settings.worlds], atol=1e-4)

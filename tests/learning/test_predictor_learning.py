@@ -45,7 +45,7 @@ def recorded():
     policy = Policy.for_environment(
         environment,
         NetworkSettings(features=8, heads=2),
-        PredictorSettings(units=4, horizons=HORIZONS, windows=2, steps=1),
+        PredictorSettings(units=4, horizons=HORIZONS, windows=2),
     )
 
     @jax.jit
@@ -141,7 +141,11 @@ def test_learns_a_circling_evader():
     steps = 20
     span = 10
     radius = 0.5
-    settings = PredictorSettings(units=32, horizons=(1, 5), windows=8, steps=4, learning_rate=6e-3)
+
+    class Fast(PredictorSettings):
+        LEARNING_RATE = 6e-3
+
+    settings = Fast(units=32, horizons=(1, 5))
     policy = Policy(predictor=settings)
     learner = PredictorLearner(policy, PursuitSettings(), total_updates=150)
     time = jnp.arange(-span, steps + 1)
@@ -233,12 +237,12 @@ def test_the_loss_counts_in_flown_distances_what_was_seen_before():
 def test_step_size_reaches_zero_at_the_end_of_the_run():
     """Adam's steps along a constant gradient are as large as its step size."""
     updates = 5
-    settings = PredictorSettings(learning_rate=0.1, windows=8, steps=4)
+    settings = PredictorSettings()
     optimiser = make_predictor_optimiser(settings, updates)
     state = optimiser.init(jnp.zeros(()))
     moved = []
     for _ in range(updates * settings.steps + 1):
         step, state = optimiser.update(jnp.ones(()), state)
         moved.append(-float(step))
-    expected = 0.1 * np.linspace(1, 0, len(moved))
-    np.testing.assert_allclose(moved, expected, rtol=1e-4, atol=1e-7)
+    expected = settings.LEARNING_RATE * np.linspace(1, 0, len(moved))
+    np.testing.assert_allclose(moved, expected, rtol=1e-4, atol=1e-9)

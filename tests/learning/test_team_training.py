@@ -32,8 +32,8 @@ SETTINGS = changed(
         history_length=3,
     ),
     network=dict(features=8, heads=2, shared_encoder=True),
-    predictor=dict(units=4, windows=2, steps=1, horizons=(1, 2)),
-    mappo=dict(minibatches=2, epochs=1),
+    predictor=dict(units=4, windows=2, horizons=(1, 2)),
+    mappo=dict(minibatches=2),
     generator=dict(capacity=8, episodes_per_task=2),
     num_envs=8,
     rollout_length=4,
@@ -56,7 +56,7 @@ def test_a_training_step_of_teams_keeps_its_carry():
 
 def test_stages_by_the_gradient_take_teams():
     parts = build(SETTINGS)
-    worlds = FirstFlightsSettings(updates=1, worlds=4, steps=2)
+    worlds = FirstFlightsSettings(updates=1)
     game = first_game(parts.environment, worlds)
     stage = GradientStage(FirstFlights(worlds, SmoothFlight(game, parts.policy)))
 
@@ -66,9 +66,9 @@ def test_stages_by_the_gradient_take_teams():
         return stage.several(1)(carry, parameters, key, 0)[1], carry.lesson.world
 
     shares, world = jax.eval_shape(first, jax.random.key(0))
-    assert shares["breaches"].shape == () and world[1].task.active.shape == (4, 4)
+    assert shares["breaches"].shape == () and world[1].task.active.shape == (worlds.WORLDS, 4)
 
-    how = AnalyticSettings(updates=1, worlds=4, draws=1)
+    how = AnalyticSettings(updates=1, worlds=4)
     lesson = LastFlights(how, SmoothFlight(free_flight(parts.environment), parts.policy))
 
     def last(key):
@@ -79,7 +79,7 @@ def test_stages_by_the_gradient_take_teams():
     total, _ = jax.eval_shape(last, jax.random.key(0))
     assert total.shape == () and total.dtype == jnp.float32
 
-    planning = WorstPlansSettings(worlds=2, plans=5, pieces=2, unseen=1.0)
+    planning = WorstPlansSettings(worlds=2)
     game = planning_game(free_flight(parts.environment))
     against_plans = WorstPlans(planning, game, lesson, SETTINGS.generator)
 

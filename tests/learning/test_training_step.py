@@ -39,8 +39,8 @@ SETTINGS = TrainSettings(
         episode_length=LENGTH, physics="rigid", capture_radius=1.0, history_length=3
     ),
     network=NetworkSettings(features=8, heads=2),
-    predictor=PredictorSettings(units=4, windows=2, steps=1, horizons=(1, 2)),
-    mappo=MappoSettings(minibatches=2, epochs=1, penalty_start=0.2, penalty_ramp=0.5),
+    predictor=PredictorSettings(units=4, windows=2, horizons=(1, 2)),
+    mappo=MappoSettings(minibatches=2, penalty_start=0.2, penalty_ramp=0.5),
     generator=GeneratorSettings(capacity=8, success_low=0.0, success_high=1.0, episodes_per_task=2),
     num_envs=12,
     rollout_length=ROLLOUT,
@@ -316,7 +316,7 @@ def _is_output(path):
             "num_envs 12 must be a multiple of mappo.minibatches 5",
         ),
         (
-            dict(predictor=PredictorSettings(windows=4, steps=1, horizons=(1, 3))),
+            dict(predictor=PredictorSettings(windows=4, horizons=(1, 3))),
             "do not fit into rollout_length 4",
         ),
         (dict(total_steps=0), "total_steps is 0"),

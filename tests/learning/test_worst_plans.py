@@ -20,7 +20,17 @@ from openjax.learning.settings import WorstPlansSettings
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings
 
-HOW = WorstPlansSettings(worlds=2, plans=9, pieces=3, piece_seconds=0.03)
+
+class Short(WorstPlansSettings):
+    """Few short plans."""
+
+    PLANS = 9
+    PIECES = 3
+    PIECE_SECONDS = 0.03
+    TEAM_PLANS = 3
+
+
+HOW = Short(worlds=2)
 
 
 def make_stage(updates):
@@ -34,7 +44,10 @@ def make_stage(updates):
 
 
 def test_what_evaders_try():
-    stage = dataclasses.replace(make_stage(4), planning=dataclasses.replace(HOW, plans=400))
+    class Many(Short):
+        PLANS = 400
+
+    stage = dataclasses.replace(make_stage(4), planning=Many(worlds=2))
     plan = jax.random.normal(jax.random.key(0), (5, 3, 3))
     tried = np.asarray(stage.search.candidates(jax.random.key(1), plan))
     assert tried.shape == (5, 400, 3, 3)
@@ -117,12 +130,12 @@ def test_pursuers_learn_from_the_worst_plan(flown):
 
 @pytest.mark.slow
 def test_the_game_that_is_shipped_can_be_learnt_with_team_plans():
-    settings = preset("evaders", worst_plans=dict(worlds=2, team_plans=3))
+    settings = preset("evaders", worst_plans=dict(worlds=2))
     game = dataclasses.replace(settings.environment, evaders=("field",))
     environment = free_flight(Pursuit(game))
     policy = build(settings, environment).policy
     usual = LastFlights(settings.analytic, SmoothFlight(environment, policy))
-    lesson = WorstPlans(settings.worst_plans, planning_game(environment), usual, settings.generator)
+    lesson = WorstPlans(HOW, planning_game(environment), usual, settings.generator)
     stage = GradientStage(lesson)
 
     def whole(key):

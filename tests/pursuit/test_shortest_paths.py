@@ -12,21 +12,16 @@ import numpy as np
 import pytest
 
 from openjax.pursuit import (
-    SCENARIOS,
     Pursuit,
     PursuitSettings,
     hover_action,
     line_up_pillars,
     make,
-    scenario_task,
     uniform_task,
 )
 from openjax.pursuit.shortest_paths import (
     ROOM,
-    SMOOTH,
     TOLL,
-    arena_points,
-    evader_territory,
     path_length,
     shortest_paths,
 )
@@ -133,48 +128,10 @@ def test_round_rows_it_is_as_long_as_on_a_grid():
     assert np.median(differences) < 0.05
 
 
-def test_territory_is_where_the_evader_is_sooner_than_anybody_by_the_shortest_path():
-    key = jax.random.key(2)
-    task = jax.jit(lambda key: line_up_pillars(GAME, key, uniform_task(GAME, key)))(key)
-    position = task.pursuer_position.at[:, 2].set(task.evader_position[2])
-    paths = jax.jit(functools.partial(shortest_paths, GAME))(task)
-    share = jax.jit(functools.partial(evader_territory, GAME))(
-        task, paths, position, task.evader_position
-    )
-    expected = []
-    for x, y in np.asarray(arena_points(GAME)):
-        if any(math.dist((x, y), pillar) < GAME.pillar_radius for pillar in task.pillar_position):
-            continue
-        place = jnp.array([x, y, task.evader_position[2]])
-        way = float(length(task, position, place).min()) - GAME.capture_radius
-        head_start = max(way, 0.0) / GAME.max_speed
-        head_start -= math.dist((x, y), task.evader_position[:2]) / GAME.evader_speed
-        expected.append(1.0 / (1.0 + math.exp(-head_start / SMOOTH)))
-    assert share == pytest.approx(np.mean(expected), abs=1e-3)
-
-
-def test_who_stands_on_both_sides_of_a_wall_leaves_less_territory_than_who_waits_before_it():
-    game = PursuitSettings(max_pillars=6)
-    task = scenario_task(game, SCENARIOS["hidden"])
-    paths = jax.jit(functools.partial(shortest_paths, game))(task)
-    evader = jnp.array([-0.15, 0.0, 1.1])
-
-    @jax.jit
-    def territory(position):
-        return evader_territory(game, task, paths, position, evader)
-
-    def left(*places):
-        return float(territory(jnp.array([[x, y, 0.6] for x, y in places])))
-
-    before_it = left((0.25, 0.0), (0.25, 0.15), (0.25, -0.15))
-    both_sides = left((0.25, 0.0), (-0.1, 0.5), (-0.1, -0.5))
-    assert both_sides < 0.5 * before_it
-
-
 def test_worlds_know_their_paths_only_where_the_reward_asks_for_them():
     key = jax.random.key(3)
     assert jax.eval_shape(Pursuit().reset, key)[1].paths is None
-    weights = dict(distance=0.0, capture=0.0, collision=0.0, over_speed=0.0, path=0.5)
+    weights = dict(distance=0.0, collision=0.0, path=0.5)
     # points that stop: which physics it is, paths don't ask
     game = make(reward=weights, physics="stops")
     _, state = jax.jit(game.reset)(key)

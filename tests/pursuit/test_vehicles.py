@@ -23,7 +23,7 @@ SETTINGS = PursuitSettings(
     speed_limit="none",
     vehicles=FAMILY,
     observe_history=3,
-    observe_history_spacing=2,
+    history_spacing=2,
 )
 
 

@@ -17,7 +17,7 @@ SETTINGS = preset(
     environment=dict(num_pursuers=1, min_pillars=0, max_pillars=1),
     network=dict(features=8, heads=1),
     predictor=dict(enabled=False),
-    first_flights=dict(updates=2 * TOGETHER, worlds=4, steps=2),
+    first_flights=dict(updates=2 * TOGETHER),
     num_envs=40,
 )
 

@@ -34,7 +34,10 @@ def test_a_runs_own_settings_are_such_a_file(tmp_path):
     ("text", "message"),
     [
         ("num_env = 3", "run.toml has the unknown key 'num_env'"),
-        ("[mappo]\nepochs = 1.5", "run.toml: mappo.epochs is 1.5; expected a whole number"),
+        (
+            "[mappo]\nminibatches = 1.5",
+            "run.toml: mappo.minibatches is 1.5; expected a whole number",
+        ),
         ("mappo = 3", "run.toml: mappo is 3; expected a table"),
     ],
 )

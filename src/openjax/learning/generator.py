@@ -60,8 +60,7 @@ def _archived_or_uniform(settings, environment, archive, key):
         )
         uniform = uniform.replace(evader=kind)
     # after the pillars, so that rows stand across the way of pursuers from all sides
-    if settings.turn:
-        uniform = turn_task(turn_key, uniform)
+    uniform = turn_task(turn_key, uniform)
     if not settings.enabled:
         return uniform
     # both are drawn and one is taken: mapped over worlds, a branch would work out both,
@@ -118,6 +117,4 @@ def vary_pillars(settings, environment, key, task):
         row = jax.random.uniform(choice_key) < settings.row_share
         lined_up = line_up_pillars(environment, row_key, task)
         task = jax.tree.map(lambda a, b: jnp.where(row, a, b), lined_up, task)
-    if settings.pillar_shift:
-        task = shift_pillars(environment, shift_key, task, settings.pillar_shift)
-    return task
+    return shift_pillars(environment, shift_key, task, settings.PILLAR_SHIFT)

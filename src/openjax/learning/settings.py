@@ -1,12 +1,12 @@
 """Settings of a training run."""
 
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated
 
 from openjax.errors import UserError
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings
-from openjax.pursuit.evaders import check_evaders
 from openjax.ranges import Interval, Seed, check_intervals
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ class MappoSettings:
     """Share of the run before the actor begins to learn: a run that starts from a
     policy without its critic learns that first.
     """
-    epochs: Annotated[int, Interval("[1, 1000]")] = 4
+    EPOCHS = 4
     """Passes over each iteration's rollouts."""
     minibatches: Annotated[int, Interval("[1, 100000]")] = 16
     """Gradient steps of one pass, each on as many worlds."""
@@ -58,7 +58,7 @@ class MappoSettings:
     """Share of the old mean and variance of the returns that value normalisation keeps
     per iteration.
     """
-    reward_scale: Annotated[float, Interval("(0, 1e6]")] = 0.1
+    REWARD_SCALE = 0.1
     """By which rewards are multiplied before they are learnt from."""
     penalty_start: Annotated[float, Interval("[0, 1]")] = 1.0
     """Share of the penalties (collision, speed, crash) that counts at the start of the
@@ -79,11 +79,7 @@ class GeneratorSettings:
     """Draw tasks from the archive of unsolved ones; False: uniform tasks only."""
     capacity: Annotated[int, Interval("[1, 10000000]")] = 5000
     """Tasks in the archive."""
-    turn: bool = True
-    """Turn uniform tasks about the arena's axis, so that they come from all sides (the
-    paper's come from one).
-    """
-    pillar_shift: Annotated[float, Interval("[0, 10]")] = 0.0
+    PILLAR_SHIFT = 0.1
     """Pillars of uniform tasks are moved by up to this along x and y (m), off the grid
     on which the paper's stand.
     """
@@ -109,6 +105,9 @@ class GeneratorSettings:
     tolerated (this to the power of the penalties' share).
     """
 
+    FORMER = MappingProxyType({"turn": True})
+    """Settings that earlier versions had, and their only value now."""
+
     def __post_init__(self):
         check_intervals(self, "generator.")
         if self.success_low > self.success_high:
@@ -122,43 +121,46 @@ class GeneratorSettings:
 class EvaderLearningSettings:
     """PPO of evaders that learn; see `openjax.learning.learners.evasion`."""
 
-    learning_rate: Annotated[float, Interval("(0, 1]")] = 1e-3
-    """Adam step size at the start of the run."""
-    learning_rate_end: Annotated[float, Interval("[0, 1]")] = 1e-4
-    """Adam step size at the end of the run, to which it falls linearly."""
-    epochs: Annotated[int, Interval("[1, 1000]")] = 3
-    """Passes over each iteration's rollouts."""
-    minibatches: Annotated[int, Interval("[1, 100000]")] = 4
-    """Gradient steps of one pass."""
-    clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.2
-    """Clip range of the probability ratio."""
-    entropy_coefficient: Annotated[float, Interval("[0, 10]")] = 1e-3
-    """Weight of the entropy."""
-    hold: Annotated[int, Interval("[1, 1000]")] = 4
-    """Control steps for which a decision is flown while it is learnt; divides
-    `rollout_length`. Noise that is new in each step averages out before an evader has
-    moved 2 cm.
-    """
-    discount: Annotated[float, Interval("[0, 1]")] = 0.99
-    """Of a decision: where one holds for 40 ms, it sees 4 s ahead. A trap takes one to
-    three.
-    """
-    gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
-    """Lambda of the generalised advantage estimate."""
-    initial_log_std: Annotated[float, Interval("[-10, 2]")] = -0.5
-    """Start of the log standard deviation of the evaders' decisions."""
-    own_axes: bool = False
-    """Evaders see in axes of their own, x away from the arena's axis."""
     past: Annotated[int, Interval("[0, 64]")] = 0
     """How many of a game's learned evaders, the last ones, are earlier selves of the
     others: who only meets the newest ones unlearns what beat the older ones.
     """
-    pool: Annotated[int, Interval("[1, 1000]")] = 32
-    """Earlier networks that are kept, from which those are drawn."""
-    pool_every: Annotated[int, Interval("[1, 1000000]")] = 10
-    """Updates after which one of the kept networks is replaced, and all earlier selves
-    are drawn anew.
+
+    LEARNING_RATE = 1e-3
+    """Adam step size at the start of the run."""
+    LEARNING_RATE_END = 1e-4
+    """Adam step size at the end of the run, to which it falls linearly."""
+    EPOCHS = 3
+    """Passes over each iteration's rollouts."""
+    MINIBATCHES = 4
+    """Gradient steps of one pass."""
+    CLIP_EPSILON = 0.2
+    """Clip range of the probability ratio (Schulman et al. 2017, arXiv 1707.06347)."""
+    ENTROPY_COEFFICIENT = 1e-3
+    """Weight of the entropy."""
+    HOLD = 4
+    """Control steps for which a decision is flown while it is learnt; divides
+    `rollout_length`. Noise that is new in each step averages out before an evader has
+    moved 2 cm.
     """
+    DISCOUNT = 0.99
+    """Of a decision: where one holds for 40 ms, it sees 4 s ahead. A trap takes one to
+    three.
+    """
+    GAE_LAMBDA = 0.95
+    """Lambda of the generalised advantage estimate (Schulman et al. 2016, arXiv
+    1506.02438).
+    """
+    INITIAL_LOG_STD = -0.5
+    """Start of the log standard deviation of the evaders' decisions, as the pursuers'."""
+    POOL = 32
+    """Earlier networks that are kept, from which earlier selves are drawn."""
+    POOL_EVERY = 10
+    """Updates after which one of the kept networks is replaced, and all earlier selves
+    are drawn again.
+    """
+    FORMER = MappingProxyType({"own_axes": False})
+    """Settings that earlier versions had, and their only value now."""
 
     def __post_init__(self):
         check_intervals(self)
@@ -168,47 +170,50 @@ class EvaderLearningSettings:
 class FirstFlightsSettings:
     """The stage before MAPPO by the gradient through the simulation; see
     `openjax.learning.gradient.first_flights`.
+
+    Its numbers were tuned for the preset `quick`. A crash is felt from afar, so that
+    pursuers go round rows of pillars and don't try gaps under half a metre.
     """
 
     updates: Annotated[int, Interval("[0, 1000000]")] = 0
     """Updates of the actor; 0: there is no such stage."""
-    worlds: Annotated[int, Interval("[1, 65536]")] = 256
+    SWITCH = "updates"
+    """Earlier versions wrote other numbers for a stage that isn't there."""
+    WORLDS = 128
     """Worlds that are simulated at once."""
-    time_step: Annotated[float, Interval("[0.0001, 0.1]")] = 0.04
+    TIME_STEP = 0.04
     """Control step (s): longer ones than the game's teach as much in fewer."""
-    steps: Annotated[int, Interval("[1, 1000]")] = 15
+    STEPS = 20
     """Control steps that are learnt at once."""
-    learning_rate: Annotated[float, Interval("(0, 1]")] = 4e-3
+    LEARNING_RATE = 2e-3
     """Adam step size at the start; falls to a twentieth."""
-    anew: Annotated[float, Interval("[0, 1]")] = 0.15
-    """Share of the worlds that start anew after each update, beside those that have
-    to.
-    """
-    distance: Annotated[float, Interval("[0, 1000]")] = 3.0
+    ANEW = 0.15
+    """Share of the worlds that restart after each update, beside those that have to."""
+    DISTANCE = 3.0
     """Weight of the nearest pursuer's mean way to the evader (m). What is minimised is
     this, the share of the time in which the evader is free, and what follows.
     """
-    crash: Annotated[float, Interval("[0, 1000]")] = 20.0
+    CRASH = 30.0
     """Weight, at the end of the stage, of the share of pursuers that touch something or
     tip over.
     """
-    crash_smooth: Annotated[float, Interval("[0.001, 1]")] = 0.012
+    CRASH_SMOOTH = 0.05
     """Distance (m) over which a touch counts from all to none: a longer one is felt
     earlier, and closes narrower ways.
     """
-    breach: Annotated[float, Interval("[0, 1000]")] = 10.0
+    BREACH = 4.0
     """Weight, at the end of the stage, of the mean number of breaches."""
-    speed: Annotated[float, Interval("[0, 1000]")] = 1.0
+    SPEED = 1.0
     """Weight of speeds over the limit."""
-    penalty_start: Annotated[float, Interval("[0, 1]")] = 0.2
+    PENALTY_START = 0.2
     """Share of the weights of crashes and breaches at the start: who fears them then
     stays away from the evader.
     """
-    penalty_free: Annotated[float, Interval("[0, 1]")] = 0.62
+    PENALTY_FREE = 0.62
     """Share of the time below which the evader must be free in an update for these
     weights to rise in it, and for tips over to begin to count.
     """
-    penalty_ramp: Annotated[float, Interval("(0, 1]")] = 0.4
+    PENALTY_RAMP = 0.4
     """Share of the stage's updates that must be such until the weights are whole."""
 
     def __post_init__(self):
@@ -229,24 +234,27 @@ class AnalyticSettings:
     """
     worlds: Annotated[int, Interval("[1, 65536]")] = 640
     """Starts in an update, and as many moments of flights."""
-    draws: Annotated[int, Interval("[1, 1000]")] = 4
-    """How many times as many starts are flown as are learnt from: the hardest."""
     learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
     """Adam step size at the start; falls linearly to a twentieth."""
     hold: Annotated[float, Interval("[0, 1000]")] = 0.04
     """Weight of the squared change of the actions in flight, in standard deviations of
     the policy's.
     """
-    breach: Annotated[float, Interval("[0, 1000]")] = 2.0
+
+    DRAWS = 4
+    """How many times as many starts are flown as are learnt from: the hardest."""
+    BREACH = 2.0
     """Weight of the breaches per step in flight, beside the share of pursuers that
-    touch something from a start.
+    touch something from a start; see `team_weight`.
     """
-    speed: Annotated[float, Interval("[0, 1000]")] = 0.6
-    """Weight of speeds over the limit in flight."""
-    speed_from: Annotated[float, Interval("[0, 10]")] = 0.97
+    SPEED = 0.6
+    """Weight of speeds over the limit in flight; see `team_weight`."""
+    SPEED_FROM = 0.97
     """Share of the maximal speed from which the speed costs."""
-    nominal: Annotated[float, Interval("[0, 1]")] = 0.25
+    NOMINAL = 0.25
     """Share of the worlds whose vehicles are nominal ones instead of the family's."""
+    FORMER = MappingProxyType({"breach": {2.0, 5.3}, "speed": {0.6, 1.6}})
+    """Earlier versions wrote weights for teams of eight slots out."""
 
     def __post_init__(self):
         check_intervals(self, "analytic.")
@@ -260,37 +268,51 @@ class WorstPlansSettings:
 
     worlds: Annotated[int, Interval("[0, 65536]")] = 0
     """Worlds in which an evader plans; 0: the last stage has none of them."""
-    plans: Annotated[int, Interval("[5, 10000]")] = 32
+
+    SWITCH = "worlds"
+    """Earlier versions wrote other numbers where no evader plans."""
+    PLANS = 32
     """Plans that each evader tries."""
-    pieces: Annotated[int, Interval("[2, 100]")] = 4
+    PIECES = 6
     """Velocities of a plan, one after the other."""
-    piece_seconds: Annotated[float, Interval("(0, 10]")] = 0.2
-    """For how long each is flown (s): four see .8 s ahead, in which an evader crosses
-    half of the arena.
+    PIECE_SECONDS = 0.2
+    """For how long each is flown (s). After plans of .8 s a planner got away in .42 of
+    `random`, after these of 1.2 s in .16.
     """
-    distance: Annotated[float, Interval("[0, 1000]")] = 1.0
+    DISTANCE = 1.0
     """Weight of the nearest pursuer's mean path to the evader (m), beside the share of
     the plan in which it is free.
     """
-    territory: Annotated[float, Interval("[0, 1000]")] = 0.0
-    """Weight of the share of the arena that the evader can be at before any pursuer,
-    beside the same: it is what those can change who aren't the nearest.
-    """
-    unseen: Annotated[float, Interval("[0, 1000]")] = 0.0
+    UNSEEN = 1.0
     """Weight of how well the evader hides from all of them, beside the same."""
-    team_plans: Annotated[int, Interval("[0, 10000]")] = 0
+    TEAM_PLANS = 48
     """Plans of the whole team that are tried against evaders' plans, by points, to show
-    pursuers what they could do; 0: none.
+    pursuers what they could do; teams of several sizes try none, as points know of no
+    empty slots.
     """
-    follow: Annotated[float, Interval("[0, 1000]")] = 3.0
+    FOLLOW = 3.0
     """Weight of how far pursuers are from where the best of these leads (m)."""
-    crash: Annotated[float, Interval("[0, 1000]")] = 8.0
-    """Weight of the share of pursuers that touch something, beside the same."""
-    breach: Annotated[float, Interval("[0, 1000]")] = 2.0
-    """Weight of the breaches per step, beside the same."""
-    hold_unseen: Annotated[float, Interval("[0, 1000]")] = 0.3
+    CRASH = 8.0
+    """Weight of the share of pursuers that touch something, beside the same; see
+    `team_weight`.
+    """
+    BREACH = 2.0
+    """Weight of the breaches per step, beside the same; see `team_weight`."""
+    HOLD_UNSEEN = 0.02
     """As `analytic.hold`, where nobody sees the evader: nothing is learnt there, and
-    what was is held.
+    what was is held; see `team_weight`.
+    """
+    FORMER = MappingProxyType(
+        {
+            "territory": 0.0,
+            "team_plans": {0, 48},
+            "crash": {8.0, 21.0},
+            "breach": {2.0, 5.3},
+            "hold_unseen": {0.02, 0.053},
+        }
+    )
+    """Settings that earlier versions had, and weights that they wrote out for teams of
+    eight slots.
     """
 
     def __post_init__(self):
@@ -403,13 +425,6 @@ class TrainSettings:
     """Share of the run after that over which the others come in, slow ones first, until
     they have their whole odds and speed.
     """
-    evaders_validation: tuple[str, ...] = ()
-    """Evaders of the validation; none: those of the training."""
-    validation_start: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the run before which a checkpoint ranks behind all later ones: the
-    validation's evaders are scripted, and who beats them early hasn't met what others
-    learn late.
-    """
     validation_interval: Annotated[int, Interval("[1, 1000000]")] = 50
     """Iterations between validations, on uniform tasks that are never trained on."""
     validation_episodes: Annotated[int, Interval("[1, 1000000]")] = 256
@@ -417,10 +432,17 @@ class TrainSettings:
     seed: Seed = 0
     """Draws the networks' first parameters, the tasks and the exploration."""
 
+    VALIDATION_EVADERS = ("field", "heavy", "pillar_hugger")
+    """Evaders of the validation where some of the training's learn: others each time, they
+    aren't comparable.
+    """
+    FORMER = MappingProxyType(
+        {"validation_start": {0.0, 1.0}, "evaders_validation": {(), VALIDATION_EVADERS}}
+    )
+    """Settings that earlier versions had; of these the evaders decide now."""
+
     def __post_init__(self):
         check_intervals(self)
-        if self.evaders_validation:
-            check_evaders(self.evaders_validation)
         for holds, text in self._demands():
             if not holds:
                 raise UserError(text)
@@ -480,22 +502,18 @@ class TrainSettings:
             "predictor: frames of each pursuer are for teams of one size; "
             "environment.history_pursuers pooled would be right",
         )
-        yield (
-            not sizes or not self.worst_plans.team_plans,
-            f"worst_plans.team_plans {self.worst_plans.team_plans} are for teams of one size; 0 "
-            "would be right",
-        )
 
     def _demands_of_evaders(self):
         """Evaders that learn decide evenly within a rollout, and one of them is no
         earlier self.
         """
         rollout = self.rollout_length
-        hold = self.evader_learning.hold
+        hold = self.evader_learning.HOLD
         learned_number = self.environment.evaders.count("learned")
         yield (
             not learned_number or rollout % hold == 0,
-            f"evader_learning.hold {hold} must divide rollout_length {rollout}",
+            f"rollout_length {rollout} must be a multiple of {hold}, for which evaders that learn "
+            "hold a decision",
         )
         past = self.evader_learning.past
         yield (
@@ -553,9 +571,22 @@ class TrainSettings:
         settings.
         """
         minibatches = {"mappo": self.mappo.minibatches}
-        if "learned" in self.environment.evaders:
-            minibatches["evader_learning"] = self.evader_learning.minibatches
+        if self.evaders_learn:
+            minibatches["evader_learning"] = self.evader_learning.MINIBATCHES
         return minibatches
+
+    @property
+    def evaders_learn(self) -> bool:
+        """True if evaders learn while pursuers do. Then scripted ones judge the validation, and
+        a checkpoint ranks behind all later ones: who beats them early hasn't met what evaders
+        learn late.
+        """
+        return "learned" in self.environment.evaders
+
+    @property
+    def validation_evaders(self) -> tuple[str, ...]:
+        """Evaders of the validation; none: those of the training."""
+        return self.VALIDATION_EVADERS if self.evaders_learn else ()
 
     @property
     def schedule(self) -> "Schedule":

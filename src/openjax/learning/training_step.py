@@ -251,7 +251,7 @@ class _Step:
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(keys)
         noise = Noise(jnp.moveaxis(noise, 1, 0))
         act = self._evaders(carry)
-        hold = settings.evader_learning.hold
+        hold = settings.evader_learning.HOLD
         if act is not None:
             decisions = (steps // hold, 3)
             draws = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(k, 1), decisions))(keys)

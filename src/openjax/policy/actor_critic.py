@@ -76,17 +76,13 @@ class Critic(nn.Module):
         """
         settings = self.settings
         dtype = jnp.dtype(settings.compute_type)
-        sees_state = settings.critic_input == "state"
         if settings.shared_encoder:
-            features = encoding
-            if sees_state:
-                features = pad(
-                    jnp.concatenate([encoding, observation.privileged.astype(dtype)], axis=-1)
-                )
+            features = pad(
+                jnp.concatenate([encoding, observation.privileged.astype(dtype)], axis=-1)
+            )
         else:
             itself = own_features(observation, prediction)
-            if sees_state:
-                itself = jnp.concatenate([itself, observation.privileged], axis=-1)
+            itself = jnp.concatenate([itself, observation.privileged], axis=-1)
             features = self._encode(itself, observation, dtype)
         # one matrix product over all worlds and pursuers
         leading = features.shape[:-1]

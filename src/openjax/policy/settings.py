@@ -31,10 +31,6 @@ class NetworkSettings:
     velocity, which a controller flies; "field": parameters of a potential field, whose
     force that controller flies (DACOOP).
     """
-    critic_input: Literal["state", "observation"] = "state"
-    """"state": the critic also sees the true evader, its velocity and the own position;
-    "observation": what the actor sees.
-    """
     critic_encoder: Literal["attention", "layers"] = "attention"
     """What the critic begins with, unless it shares the actor's encoder. "attention":
     an encoder like the actor's; "layers": two layers, twice as wide as `features`, on
@@ -44,6 +40,9 @@ class NetworkSettings:
     """The critic is a layer on the actor's encoder, which halves the cost of an update;
     what it sees beside the actor joins behind the encoder. False: an encoder each.
     """
+
+    FORMER = MappingProxyType({"critic_input": "state"})
+    """Settings that earlier versions had, and their only value now."""
 
     def __post_init__(self):
         check_intervals(self, "network.")
@@ -69,16 +68,16 @@ class PredictorSettings:
     """Control steps ahead at which positions are predicted; the first is 1. The paper's
     are 1 to 5.
     """
-    learning_rate: Annotated[float, Interval("(0, 1]")] = 1e-3
+    LEARNING_RATE = 1e-3
     """Adam step size at the start; falls linearly to zero over `total_steps`. The paper's
     stays at 1e-4.
     """
     windows: Annotated[int, Interval("[1, 1000]")] = 8
-    """Windows of each environment's rollout that one iteration trains on."""
-    steps: Annotated[int, Interval("[1, 1000]")] = 4
-    """Gradient steps per iteration, over disjoint windows."""
+    """Windows of each environment's rollout that one iteration trains on; even."""
 
-    FORMER = MappingProxyType({"relative": True, "loss": "scaled", "decay": True})
+    WINDOWS_PER_STEP = 2
+    """Windows of one gradient step: an iteration's steps are over disjoint ones."""
+    FORMER = MappingProxyType({"relative": True, "loss": "scaled", "decay": True, "steps": 4})
     """Settings that earlier versions had, and their only value now."""
 
     def __post_init__(self):
@@ -90,7 +89,10 @@ class PredictorSettings:
             raise UserError(
                 f"predictor.horizons {list(self.horizons)[:20]} must start with 1 and rise"
             )
-        if self.windows % self.steps:
-            raise UserError(
-                f"predictor: windows {self.windows} must be a multiple of steps {self.steps}"
-            )
+        if self.windows % self.WINDOWS_PER_STEP:
+            raise UserError(f"predictor: windows {self.windows} must be even")
+
+    @property
+    def steps(self) -> int:
+        """Gradient steps per iteration."""
+        return self.windows // self.WINDOWS_PER_STEP

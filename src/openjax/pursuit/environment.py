@@ -295,7 +295,7 @@ class Pursuit:
         if not settings.observe_history:
             return None
         first = own_frame(drones.quaternion, drones.velocity, action)
-        return _repeat(first, settings.observe_history * settings.observe_history_spacing)
+        return _repeat(first, settings.observe_history * settings.history_spacing)
 
     def with_bounds(self, vehicle_bounds: Float[Array, "ranges 4"]) -> "Pursuit":
         """The same game with vehicles drawn within these bounds (R, 4)."""

@@ -208,7 +208,7 @@ def _own_part(settings, state, seen_drones, turn_back):
         radius = jnp.float32(arena_of(settings, state.task).arena_radius)
         parts.append(jnp.broadcast_to(radius, (len(position), 1)))
     if settings.observe_history:
-        spacing = settings.observe_history_spacing
+        spacing = settings.history_spacing
         history = jnp.moveaxis(state.own_history[spacing - 1 :: spacing], 0, 1)
         # the past is seen in today's axes: velocity, body x and z axes are vectors, the
         # command is none

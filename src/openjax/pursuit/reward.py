@@ -150,7 +150,7 @@ def default_reward(weights: RewardSettings) -> tuple[Term, ...]:
     # the order stays: sums of floats depend on it, and first updates are compared to
     # the bit
     terms = (
-        Term(captured, weights.capture),
+        Term(captured, weights.CAPTURE),
         Term(evader_distance, -weights.distance),
         Term(evader_path, -weights.path),
         Term(unseen, -weights.unseen),
@@ -158,7 +158,7 @@ def default_reward(weights: RewardSettings) -> tuple[Term, ...]:
         Term(recapture, weights.recapture),
         Term(steadiness, weights.smoothness),
         Term(breach_number, -weights.collision, penalty=True),
-        Term(speeding, -weights.over_speed, penalty=True),
+        Term(speeding, -weights.OVER_SPEED, penalty=True),
         Term(crashing, -weights.crash, penalty=True),
         Term(first_crash, -weights.first_crash, penalty=True),
     )

@@ -23,7 +23,7 @@ LAYOUT_PURSUERS = 3
 
 OBSERVED = (
     *("observed_pillars", "observe_time", "observe_position", "observe_game"),
-    *("observe_arena", "observe_in", "observe_history", "observe_history_spacing"),
+    *("observe_arena", "observe_in", "observe_history"),
     *("history_length", "history_spacing", "history_pursuers"),
     *("track_unseen", "strategies", "strategy_seconds"),
 )
@@ -36,7 +36,7 @@ class RewardSettings:
     code's, at the collision's weight.
     """
 
-    capture: Annotated[float, Interval("[0, 1e6]")] = 6.0
+    CAPTURE = 6.0
     """To every pursuer, in each step in which any pursuer captures."""
     first_capture: Annotated[float, Interval("[0, 1e6]")] = 0.0
     """To every pursuer, once, at an episode's first capture: where the evader gets away
@@ -61,7 +61,7 @@ class RewardSettings:
     """
     collision: Annotated[float, Interval("[0, 1e6]")] = 10.0
     """Subtracted per breach of a safety distance or an arena bound."""
-    over_speed: Annotated[float, Interval("[0, 1e6]")] = 10.0
+    OVER_SPEED = 10.0
     """Subtracted in each step above 1.01 times the maximal speed."""
     smoothness: Annotated[float, Interval("[0, 1e6]")] = 0.0
     """Weight of `exp(-|a_t - a_{t-1}|)`; 2.0 in the paper's second stage."""
@@ -240,12 +240,10 @@ class PursuitSettings:
     command (not in the paper): they show how this vehicle answers, and which commands
     are still on their way.
     """
-    observe_history_spacing: Annotated[int, Interval("[1, 1000]")] = 1
-    """Control steps between two of these frames."""
     history_length: Annotated[int, Interval("[1, 1000]")] = 10
     """Frames that the evader predictor sees."""
     history_spacing: Annotated[int, Interval("[1, 1000]")] = 1
-    """Control steps between two frames of the history."""
+    """Control steps between two frames of either history."""
     history_pursuers: Literal["each", "pooled", "both"] = "each"
     """What these frames hold of the pursuers. "each": all positions, as in the paper;
     "pooled": where the nearest one is and whence all press, for teams of any size;
@@ -253,7 +251,7 @@ class PursuitSettings:
     """
     reward: RewardSettings = field(default_factory=RewardSettings)
 
-    FORMER = MappingProxyType({"evader_norm": "euclidean"})
+    FORMER = MappingProxyType({"evader_norm": "euclidean", "observe_history_spacing": 1})
     """Settings that earlier versions had, and their only value now."""
 
     def __post_init__(self):

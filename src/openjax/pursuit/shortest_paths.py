@@ -9,11 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
 
 from openjax.pursuit.settings import PursuitSettings
-from openjax.pursuit.shapes import Each, Scalar, Team, Vector
-from openjax.pursuit.task import Task, arena_of, capture_radius, evader_speed
+from openjax.pursuit.shapes import Each, Team, Vector
+from openjax.pursuit.task import Task, arena_of
 
 CORNERS = 6
 """Of the polygon about each pillar."""
@@ -24,10 +23,6 @@ through saves: pursuers then stand before it.
 """
 TOLL = 3.0
 """Cost of a path through a pillar (m): more than any path round."""
-POINTS = 40
-"""Of the arena at which is asked who is there first: one for each 6 dm²."""
-SMOOTH = 0.1
-"""Seconds over which a point goes from one side to the other."""
 
 
 @struct.dataclass
@@ -42,7 +37,6 @@ class ShortestPaths:
     of no pillar.
     """
     length: jax.Array  # (C, C) m, of the shortest path from one to another
-    to_point: jax.Array  # (C, M) m, from a corner to each of `arena_points`
 
 
 def shortest_paths(settings: PursuitSettings, task: Task) -> ShortestPaths:
@@ -69,10 +63,7 @@ def shortest_paths(settings: PursuitSettings, task: Task) -> ShortestPaths:
     length = direct
     if corner.shape[0]:
         length = jax.lax.fori_loop(0, corner.shape[0], shorten, direct)
-    # a path's last bend is one of the corners, the first one perhaps
-    last = _straight(settings, task, corner[:, None], arena_points(settings))
-    through = jnp.min(length[:, :, None] + last, axis=1, initial=jnp.inf)
-    return ShortestPaths(corner, toll, length, jnp.minimum(last, through))
+    return ShortestPaths(corner, toll, length)
 
 
 def path_length(
@@ -97,44 +88,6 @@ def path_length(
     # bend
     level = jnp.sqrt(jnp.sum((position[:, :2] - bend) ** 2, axis=-1) + 1e-9) + rest
     return jnp.sqrt(level**2 + (position[:, 2] - target[2]) ** 2)
-
-
-def arena_points(settings: PursuitSettings) -> Float[Array, "points 2"]:
-    """(M, 2) m, points spread evenly over the arena: Vogel's sunflower (1979, A better
-    way to construct the sunflower head).
-    """
-    index = np.arange(POINTS)
-    radius = np.sqrt((index + 0.5) / POINTS)
-    angle = index * np.pi * (3.0 - np.sqrt(5.0))
-    points = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], -1)
-    return settings.arena_radius * jnp.asarray(points, jnp.float32)
-
-
-def evader_territory(
-    settings: PursuitSettings, task: Task, paths: ShortestPaths, position: Team, target: Vector
-) -> Scalar:
-    """() share of the arena that the evader at (3,) is at before any of the pursuers at
-    (N, 3) has it within the capture radius: smooth, in the plane, and with the evader
-    flying straight.
-
-    Empty slots' pursuers are parked too far to count.
-    """
-    points = arena_points(arena_of(settings, task))
-    place = position[:, None, :2]
-    # whoever of the team is sooner at a corner is sooner wherever the path leads from
-    # there
-    to_corner = jnp.min(_straight(settings, task, place, paths.corner), axis=0)
-    round_pillars = jnp.min(
-        (to_corner + paths.toll)[:, None] + paths.to_point, axis=0, initial=jnp.inf
-    )
-    straight = jnp.min(_straight(settings, task, place, points), axis=0)
-    length = jnp.minimum(straight, round_pillars)
-    pursuers = jax.nn.relu(length - capture_radius(settings, task)) / settings.max_speed
-    evader = jnp.sqrt(jnp.sum((points - target[:2]) ** 2, axis=-1) + 1e-12)
-    first = jax.nn.sigmoid((pursuers - evader / evader_speed(settings, task)) / SMOOTH)
-    to_axis = jnp.sum((points[:, None] - task.pillar_position) ** 2, axis=-1)
-    inside = jnp.any((to_axis < settings.pillar_radius**2) & task.pillar_active, axis=-1)
-    return jnp.mean(first, where=~inside)
 
 
 def _straight(settings, task, start, end):

@@ -102,7 +102,7 @@ def compile_first_flights(
     game = first_game(job.parts.environment, stage)
     flight = SmoothFlight(game, _exact(job.parts.policy))
     flights = FirstFlights(stage, flight, job.settings.generator)
-    devices = _number_of_devices(policy, stage.worlds)
+    devices = _number_of_devices(policy, stage.WORLDS)
     places = None if devices == 1 else everywhere(devices)
     begin, some, shardings = make_device_first_flights(
         flights, min(TOGETHER, stage.updates), devices
@@ -132,14 +132,14 @@ def compile_last_stage(job: TrainingJob, policy: PolicyParameters) -> CompiledSt
     exact = _exact(job.parts.policy)
     analytic = settings.analytic
     if not settings.worst_plans.worlds:
-        flight = SmoothFlight(free_flight(environment), exact, analytic.speed_from)
+        flight = SmoothFlight(free_flight(environment), exact)
         lesson = LastFlights(analytic, flight)
     else:
         # networks that learned with the policy aren't in its file
         names = tuple(name for name in environment.settings.evaders if name != "learned")
         game_settings = dataclasses.replace(environment.settings, evaders=names or ("field",))
         game = free_flight(dataclasses.replace(environment, settings=game_settings))
-        usual = LastFlights(analytic, SmoothFlight(game, exact, analytic.speed_from))
+        usual = LastFlights(analytic, SmoothFlight(game, exact))
         lesson = WorstPlans(settings.worst_plans, planning_game(game), usual, settings.generator)
     return compile_stage(GradientStage(lesson), abstract_like(policy))
 

@@ -129,7 +129,7 @@ def _make_validation(job, policy):
         job.parts.environment,
         job.parts.policy,
         settings.validation_episodes,
-        settings.evaders_validation,
+        settings.validation_evaders,
     )
     tasks = validation.tasks["validation"]
     validation.evaluator.compile_ahead(abstract_like(policy), tasks)()

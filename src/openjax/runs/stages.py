@@ -207,7 +207,7 @@ class Evaluation:
         score = selection_score(uniform, settings.environment.episode_length)
         if int(carry.update) == 0:
             self.run.progress.message(first_flights_words(uniform))
-        if int(carry.update) < settings.validation_start * settings.total_updates:
+        if settings.evaders_learn and int(carry.update) < settings.total_updates:
             score -= EARLY
         return processes.of_first((score, {**flat_metrics(uniform, far_tasks), "score": score}))
 

@@ -19,7 +19,7 @@ MAY_CHANGE = ("total_steps", "validation_interval", "validation_episodes")
 class TrainCommand:
     """Train pursuers to capture a faster evader.
 
-    Every setting of the run can be given, such as --mappo.epochs 2. The defaults shown
+    Every setting of the run can be given, such as --mappo.minibatches 8. The defaults shown
     are those of the preset quick, or of the one given: openjax train --preset paper
     --help.
     """

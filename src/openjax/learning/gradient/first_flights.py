@@ -49,12 +49,12 @@ def first_game(environment: Pursuit, stage: FirstFlightsSettings) -> Pursuit:
     """
     free = free_flight(environment)
     game = free.settings
-    ratio = max(1, round(stage.time_step / game.time_step))
+    ratio = max(1, round(stage.TIME_STEP / game.time_step))
     game = dataclasses.replace(
         game,
         time_step=ratio * game.time_step,
         substeps=max(1, round(ratio * game.time_step / PHYSICS_STEP)),
-        episode_length=max(stage.steps, game.episode_length // ratio),
+        episode_length=max(stage.STEPS, game.episode_length // ratio),
     )
     return dataclasses.replace(free, settings=game, dynamics=None)
 
@@ -91,7 +91,7 @@ class FirstFlights:
     def optimiser(self) -> optax.GradientTransformation:
         """Adam with clipped gradients; its step size falls to a twentieth."""
         schedule = optax.cosine_decay_schedule(
-            self.settings.learning_rate, max(self.settings.updates, 1), SLOWEST_RATE
+            self.settings.LEARNING_RATE, max(self.settings.updates, 1), SLOWEST_RATE
         )
         return clipped_descent(schedule)
 
@@ -109,7 +109,7 @@ class FirstFlights:
         environment = self.flight.environment
         game = environment.settings
         task_keys, reset_keys = (
-            own_share(jax.random.split(k, self.settings.worlds), self.axis)
+            own_share(jax.random.split(k, self.settings.WORLDS), self.axis)
             for k in jax.random.split(key)
         )
         tasks = jax.vmap(functools.partial(draw_anywhere, game, self.tasks))(task_keys)
@@ -123,24 +123,24 @@ class FirstFlights:
         """
         settings = self.settings
         is_fast_possible = self.flight.game.speed_limit == "none"
-        end, encounter = self.flight.fly(actor, parameters, world, settings.steps)
+        end, encounter = self.flight.fly(actor, parameters, world, settings.STEPS)
         # with whole penalties from the start, pursuers stay away from the evader for
         # good
-        penalty = settings.penalty_start + (1.0 - settings.penalty_start) * ramp
+        penalty = settings.PENALTY_START + (1.0 - settings.PENALTY_START) * ramp
         parts = {
             "free": (1.0, encounter.free),
             # along the shortest path: by the straight line they wait in sight of the
             # evader, on the wrong side of a row of pillars
-            "distance": (settings.distance, encounter.distance),
+            "distance": (settings.DISTANCE, encounter.distance),
             # felt from farther than a touch, or they never leave such a place either:
             # over 5 cm they go round rows and hardly crash, over 1 cm they do neither
             "crashes": (
-                penalty * settings.crash,
-                crash_share(encounter.least, settings.crash_smooth),
+                penalty * settings.CRASH,
+                crash_share(encounter.least, settings.CRASH_SMOOTH),
             ),
-            "tips": (ramp * settings.crash, tip_share(encounter.upright)),
-            "breaches": (penalty * settings.breach, encounter.breach),
-            "speed": (settings.speed * is_fast_possible, encounter.excess),
+            "tips": (ramp * settings.CRASH, tip_share(encounter.upright)),
+            "breaches": (penalty * settings.BREACH, encounter.breach),
+            "speed": (settings.SPEED * is_fast_possible, encounter.excess),
             "low": (1.0, jax.nn.relu(LOW - end[1].drones.position[..., 2])),
         }
         total, means = weighted_sum(parts)
@@ -160,12 +160,12 @@ class FirstFlights:
         gradient, parts = mean_over_devices((gradient, parts), self.axis)
         # penalties wait for pursuers that catch: who fears a crash before that never
         # comes near
-        step = 1.0 / (self.settings.penalty_ramp * max(self.settings.updates, 1))
+        step = 1.0 / (self.settings.PENALTY_RAMP * max(self.settings.updates, 1))
         ramp = jnp.minimum(
-            ramp + jnp.where(parts["free"] < self.settings.penalty_free, step, 0.0), 1.0
+            ramp + jnp.where(parts["free"] < self.settings.PENALTY_FREE, step, 0.0), 1.0
         )
         start_key, choice_key = jax.random.split(turn.key)
-        worlds_drawn = jax.random.uniform(choice_key, (self.settings.worlds,)) < self.settings.anew
+        worlds_drawn = jax.random.uniform(choice_key, (self.settings.WORLDS,)) < self.settings.ANEW
         over = self._over(end[1]) | own_share(worlds_drawn, self.axis)
         world = where_rows(over, self.start(start_key), end)
         return Learnt(gradient, FirstWorlds(world, ramp), parts)
@@ -175,5 +175,5 @@ class FirstFlights:
         moment.
         """
         game = self.flight.game
-        is_late = state.step > game.episode_length - self.settings.steps
+        is_late = state.step > game.episode_length - self.settings.STEPS
         return is_lost(game, state) | is_late

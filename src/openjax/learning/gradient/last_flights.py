@@ -25,6 +25,7 @@ from openjax.learning.gradient.measures import (
     crash_depth,
     crash_share,
     end_excess,
+    team_weight,
 )
 from openjax.learning.gradient.stage import (
     Learnt,
@@ -92,7 +93,7 @@ class LastFlights:
         ones.
         """
         settings = self.settings
-        return partly_nominal(self.flight.game.vehicles, settings.worlds, settings.nominal)
+        return partly_nominal(self.flight.game.vehicles, settings.worlds, settings.NOMINAL)
 
     def starts(self, key: PRNGKeyArray, bounds: Bounds):
         """Worlds to learn from, at their starts; bounds (B, R, 4)."""
@@ -126,10 +127,10 @@ class LastFlights:
         return ()
 
     def hard_starts(self, actor: Any, parameters: PolicyParameters, key: PRNGKeyArray):
-        """Of `settings.draws` times as many starts those with the least gaps on the
+        """Of `settings.DRAWS` times as many starts those with the least gaps on the
         actor's way: few of all come near a crash.
         """
-        starts = self.starts(key, jnp.concatenate([self.bounds()] * self.settings.draws))
+        starts = self.starts(key, jnp.concatenate([self.bounds()] * self.settings.DRAWS))
         encounter = self.flight.fly(actor, parameters, starts, self.steps)[1]
         least = jnp.min(encounter.least, axis=-1)
         hardest = jax.lax.top_k(-least, self.settings.worlds)[1]
@@ -140,6 +141,7 @@ class LastFlights:
     ) -> tuple[Scalar, dict[str, Scalar]]:
         """What is learnt (), and its parts. `parameters` are the policy's before."""
         settings = self.settings
+        weight = functools.partial(team_weight, self.flight.game)
         number = starts[1].step.shape[0]
         change = self.flight.change(actor, parameters, flying[0])
         # starts and flights by one program, the starts first
@@ -153,8 +155,8 @@ class LastFlights:
             # the speed is free but for its end
             "ends": (END, end_excess(ends)),
             "crashes_in_flight": (CRASH_IN_FLIGHT, crash_share(encounter.least[number:])),
-            "breaches_in_flight": (settings.breach, encounter.breach[number:]),
-            "speed_in_flight": (settings.speed, encounter.excess[number:]),
+            "breaches_in_flight": (weight(settings.BREACH), encounter.breach[number:]),
+            "speed_in_flight": (weight(settings.SPEED), encounter.excess[number:]),
             "change": (settings.hold, change),
         }
         return weighted_sum(parts)

@@ -21,11 +21,17 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
-from jaxtyping import Array, Bool, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from openjax.learning.drawn_starts import draw_anywhere, is_lost
 from openjax.learning.gradient.last_flights import LastFlights
-from openjax.learning.gradient.measures import SmoothFlight, crash_share, mean_step
+from openjax.learning.gradient.measures import (
+    SmoothFlight,
+    Worlds,
+    crash_share,
+    mean_step,
+    team_weight,
+)
 from openjax.learning.gradient.stage import (
     Learnt,
     Turn,
@@ -93,6 +99,12 @@ class Example(NamedTuple):
     gain: jax.Array
     """(B,) from 0 to 1, how much better the team's plan is than what they do"""
 
+    def distance(self, position: Float[Array, "worlds pieces pursuers 3"]) -> Worlds:
+        """(B,) m, how far pursuers are from their places, by the gain."""
+        square = jnp.sum((position - self.places) ** 2, axis=-1)
+        # of two ways round a pillar the nearer one: a mean of both leads into it
+        return self.gain * jnp.mean(jnp.sqrt(square + NEAR**2) - NEAR, axis=(1, 2))
+
 
 @dataclass(frozen=True, eq=False)
 class WorstPlans:
@@ -124,15 +136,15 @@ class WorstPlans:
     def search(self) -> PlanSearch:
         """The evaders' plans; to stay and their own rule are two of them."""
         planning = self.planning
-        piece_steps = max(1, round(planning.piece_seconds / self.game.time_step))
-        plans = PlanSettings(planning.plans, planning.pieces, piece_steps)
+        piece_steps = max(1, round(planning.PIECE_SECONDS / self.game.time_step))
+        plans = PlanSettings(planning.PLANS, planning.PIECES, piece_steps)
         return PlanSearch(plans, self.game, constant=(0.0, np.nan))
 
     @functools.cached_property
     def team(self) -> TeamSearch:
         """What a team could do."""
         seconds = self.search.settings.steps * self.game.time_step
-        return TeamSearch(self.game, self.planning.team_plans, seconds)
+        return TeamSearch(self.game, self.planning.TEAM_PLANS, seconds)
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
@@ -151,7 +163,7 @@ class WorstPlans:
         """Fresh worlds, and no plan yet."""
         worlds = self.planning.worlds
         team = None
-        if self.planning.team_plans:
+        if not self.game.team_sizes:
             none = no_plan(self.game.num_pursuers)
             team = jax.tree.map(lambda leaf: jnp.stack([leaf] * worlds), none)
         return PlannedWorlds(self.start(key), self.search.no_plan(worlds), team)
@@ -200,7 +212,7 @@ class WorstPlans:
         paths = jax.vmap(team.paths)(world[1].task)
         room = jax.vmap(jax.vmap(team.room, (0, None)))(trials.end, paths)
         worth = trials.free * (self.game.time_step / STEP) + room
-        most = jax.lax.top_k(trials.promise, min(ANSWERS, self.planning.plans))[1]
+        most = jax.lax.top_k(trials.promise, min(ANSWERS, self.planning.PLANS))[1]
 
         def pick(leaf):
             return jax.vmap(lambda values, places: values[places])(leaf, most)
@@ -211,7 +223,7 @@ class WorstPlans:
         best, promise = jax.vmap(team.search)(world[1], paths, velocities, team_plan, keys)
         gain = jnp.max(pick(worth), axis=1) - promise
         way = jax.vmap(team.way)(world[1], paths, best, self._velocities(task, plan))
-        ends_of_pieces = np.arange(1, self.planning.pieces + 1) * team.steps // self.planning.pieces
+        ends_of_pieces = np.arange(1, self.planning.PIECES + 1) * team.steps // self.planning.PIECES
         places = way[:, ends_of_pieces - 1]
         return best, Example(places, jnp.clip((gain - MARGIN) / CLEAR, 0.0, 1.0))
 
@@ -219,7 +231,7 @@ class WorstPlans:
         """(B, ..., steps, 3) m/s at the points' steps of plans (B, ..., pieces, 3) of
         the evaders of tasks (B, ...); who flies by its own rule is taken to stay.
         """
-        pieces = self.planning.pieces
+        pieces = self.planning.PIECES
         piece = np.arange(self.team.steps) * pieces // self.team.steps
         shares = jnp.nan_to_num(plans[..., piece, :])
         speed = jnp.asarray(evader_speed(self.game, task))
@@ -237,6 +249,7 @@ class WorstPlans:
         first piece, and the loss's parts.
         """
         planning = self.planning
+        weight = functools.partial(team_weight, self.game)
         steps = self.search.settings.piece_steps
 
         def piece(world, velocity):
@@ -247,43 +260,26 @@ class WorstPlans:
         worlds, encounter = jax.lax.scan(piece, world, jnp.moveaxis(plan, 1, 0))[1]
         next_worlds = jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf[0]), worlds)
         change = self.flight.change(actor, parameters, world[0])
-        # the gradient knows where the evader is, and who doesn't see it can't learn
-        # from that: they would unlearn to search
+        # the gradient knows where the evader is: who doesn't see it would unlearn to search
         is_seen = world[1].seen.astype(jnp.float32)
-        hold = jnp.where(world[1].seen, self.usual.settings.hold, planning.hold_unseen)
-        distance = is_seen * jnp.mean(encounter.distance, axis=0)
+        hold = jnp.where(world[1].seen, self.usual.settings.hold, weight(planning.HOLD_UNSEEN))
         positions = jnp.moveaxis(worlds[1].drones.position, 0, 1)
         parts = {
             "free": (1.0, is_seen * jnp.mean(encounter.free, axis=0)),
-            "distance": (planning.distance, distance),
-            **self._optional_parts(encounter, is_seen, positions, example),
-            "crashes": (planning.crash, crash_share(jnp.min(encounter.least, axis=0))),
-            "breaches": (planning.breach, encounter.breach),
-            "speed": (self.usual.settings.speed, encounter.excess),
+            "distance": (planning.DISTANCE, is_seen * jnp.mean(encounter.distance, axis=0)),
+            # where nobody sees it, too: to look where it was last seen is what is to be learnt
+            "unseen": (planning.UNSEEN, encounter.unseen),
+        }
+        if example is not None:
+            parts["follow"] = (planning.FOLLOW, is_seen * example.distance(positions))
+        parts |= {
+            "crashes": (weight(planning.CRASH), crash_share(jnp.min(encounter.least, axis=0))),
+            "breaches": (weight(planning.BREACH), encounter.breach),
+            "speed": (weight(self.usual.settings.SPEED), encounter.excess),
             "held": (1.0, hold[:, None] * change),
         }
         total, means = weighted_sum(parts)
         return total, (next_worlds, means)
-
-    def _optional_parts(self, encounter, weight, position, example):
-        """Parts of the loss that a stage may have, `weight` (B,) where the evader is
-        seen; what isn't weighed isn't worked out, nor told.
-        """
-        planning = self.planning
-        parts = {}
-        if planning.territory:
-            territory = weight * jnp.mean(encounter.territory, axis=0)
-            parts["territory"] = (planning.territory, territory)
-        if planning.unseen:
-            # where nobody sees it, too: to look where it was last seen is what is to be
-            # learnt
-            parts["unseen"] = (planning.unseen, encounter.unseen)
-        if example is not None:
-            square = jnp.sum((position - example.places) ** 2, axis=-1)
-            # of two ways round a pillar the nearer one: a mean of both leads into it
-            off = jnp.mean(jnp.sqrt(square + NEAR**2) - NEAR, axis=(1, 2))
-            parts["follow"] = (planning.follow, weight * example.gain * off)
-        return parts
 
     @property
     def programs(self):
@@ -305,7 +301,7 @@ class WorstPlans:
             return plan, promise, None, None
         show_key = jax.random.fold_in(key, 1)
         team, example = self.show(trials, worlds.world, worlds.team, plan, show_key)
-        team = team.replace(until=team.until - self.planning.piece_seconds)
+        team = team.replace(until=team.until - self.planning.PIECE_SECONDS)
         return plan, promise, team, example
 
     def _learn_from_plans(self, turn: Turn, results: tuple):

@@ -99,8 +99,8 @@ class EvaderLearner:
     def optimiser(self) -> optax.GradientTransformation:
         """Of each network."""
         settings = self.settings
-        steps = self.updates * settings.epochs * settings.minibatches
-        rate = optax.linear_schedule(settings.learning_rate, settings.learning_rate_end, steps)
+        steps = self.updates * settings.EPOCHS * settings.MINIBATCHES
+        rate = optax.linear_schedule(settings.LEARNING_RATE, settings.LEARNING_RATE_END, steps)
         return for_many(clipped_adam(1.0, rate))
 
     def start(self, parameters: PolicyParameters, key: PRNGKeyArray) -> LearningEvaders:
@@ -109,22 +109,22 @@ class EvaderLearner:
         them.
         """
         numbers = jnp.arange(self.number)
-        init = jax.vmap(functools.partial(init_network, own_axes=self.settings.own_axes))
+        init = jax.vmap(init_network)
         actor_keys, critic_keys = jax.vmap(lambda key: jax.random.split(key, self.number))(
             jax.random.split(key)
         )
         actor = init(actor_keys, numbers)
         critic = init(critic_keys, numbers)
-        log_std = jnp.full((self.number, 3), self.settings.initial_log_std, jnp.float32)
+        log_std = jnp.full((self.number, 3), self.settings.INITIAL_LOG_STD, jnp.float32)
         # the pool begins full, with the fresh actors in turn
-        places = jnp.arange(self.settings.pool) % self.number
+        places = jnp.arange(self.settings.POOL) % self.number
         return LearningEvaders(
             actor=actor,
             critic=critic,
             log_std=log_std,
             optimiser=self.optimiser.init((actor, critic, log_std)),
             pool=jax.tree.map(lambda leaf: leaf[places], actor),
-            past=jnp.arange(self.settings.past, dtype=jnp.int32) % self.settings.pool,
+            past=jnp.arange(self.settings.past, dtype=jnp.int32) % self.settings.POOL,
             update=jnp.zeros((), jnp.int32),
         )
 
@@ -202,7 +202,7 @@ class EvaderLearner:
             (TrainState(evaders.networks, evaders.optimiser),),
             (self.optimiser,),
             gradient,
-            shuffle(key, self.settings.epochs, self.settings.minibatches),
+            shuffle(key, self.settings.EPOCHS, self.settings.MINIBATCHES),
         )
         actor, critic, log_std = learnt.parameters
         evaders = evaders.replace(
@@ -220,11 +220,11 @@ class EvaderLearner:
         """Now and then one of the actors takes a place in the pool, and other earlier
         selves fly.
         """
-        due = evaders.update % self.settings.pool_every == 0
+        due = evaders.update % self.settings.POOL_EVERY == 0
         network_key, place_key, past_key = jax.random.split(key, 3)
         network = jax.random.randint(network_key, (), 0, self.number)
-        place = jax.random.randint(place_key, (), 0, self.settings.pool)
-        slots = jax.random.randint(past_key, (self.settings.past,), 0, self.settings.pool)
+        place = jax.random.randint(place_key, (), 0, self.settings.POOL)
+        slots = jax.random.randint(past_key, (self.settings.past,), 0, self.settings.POOL)
 
         def renew(pool, actor):
             return pool.at[place].set(jnp.where(due, actor[network], pool[place]))
@@ -280,9 +280,9 @@ class EvaderLearner:
 
         # weighted too: before the first of its worlds begins, a network's noise stays
         # as it is
-        bonus = mean(self.settings.entropy_coefficient * gaussian_entropy(log_std))
+        bonus = mean(self.settings.ENTROPY_COEFFICIENT * gaussian_entropy(log_std))
         answer = Answer(log_prob, outputs(critic, features)[1], bonus)
-        objective = Objective(mean, self.settings.clip_epsilon, optax.l2_loss)
+        objective = Objective(mean, self.settings.CLIP_EPSILON, optax.l2_loss)
         return objective.loss(answer, part)[0]
 
     def _batch(self, evaders, samples, last, axis):
@@ -309,11 +309,11 @@ class EvaderLearner:
             advantage=normalise(advantage, mean),
             target=advantage + value,
         )
-        which = minibatches(samples.which[:1], settings.minibatches)[..., 0]  # (M, W)
+        which = minibatches(samples.which[:1], settings.MINIBATCHES)[..., 0]  # (M, W)
         belongs = which[:, None] == jnp.arange(self.number)[:, None]  # (M, K, W)
         # False comes before True: a network's own worlds first
         worlds = jnp.sum(belongs, axis=-1), jnp.argsort(~belongs, axis=-1)
-        return worlds, minibatches(batch, settings.minibatches)
+        return worlds, minibatches(batch, settings.MINIBATCHES)
 
     def _advantages(self, evaders, samples, last):
         """Of samples (T, E), and the critics' values."""
@@ -329,7 +329,7 @@ class EvaderLearner:
             jnp.concatenate([value[1:], last_value[None]]),
             is_over,
             jnp.zeros_like(is_over),
-            self.settings.discount,
-            self.settings.gae_lambda,
+            self.settings.DISCOUNT,
+            self.settings.GAE_LAMBDA,
         )
         return advantage, value

@@ -102,7 +102,7 @@ def make_optimiser(
 
     With a `target_kl` the actor's update takes `kl`; see `follow_kl`.
     """
-    steps = total_updates * settings.epochs * settings.minibatches
+    steps = total_updates * settings.EPOCHS * settings.minibatches
     schedule = optax.linear_schedule(settings.learning_rate, 0.0, steps)
 
     def late(count):
@@ -232,7 +232,7 @@ class Mappo:
             # for who falls out nothing comes after
             is_terminal |= active[:-1] & ~active[1:]
         advantage = generalised_advantages(
-            settings.reward_scale * rollout.reward,
+            settings.REWARD_SCALE * rollout.reward,
             value,
             next_values,
             is_terminal,
@@ -317,7 +317,7 @@ class Mappo:
         steps that each sees; None: it sees all.
         """
         settings = self.settings
-        order = shuffle(key, settings.epochs, settings.minibatches)
+        order = shuffle(key, settings.EPOCHS, settings.minibatches)
         if settings.step_subsampling == 1:
             return order, None
         draw = jax.random.fold_in(key, 1)

@@ -25,7 +25,7 @@ def make_predictor_optimiser(
 ) -> optax.GradientTransformation:
     """Adam, with gradients cut at norm 1."""
     steps = total_updates * settings.steps
-    step_size = optax.linear_schedule(settings.learning_rate, 0.0, steps)
+    step_size = optax.linear_schedule(settings.LEARNING_RATE, 0.0, steps)
     return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(step_size))
 
 

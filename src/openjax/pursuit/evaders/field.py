@@ -54,7 +54,8 @@ def field_velocity(
     # pillars and wall push on the level alone, ceiling and floor upright
     force = force + jnp.concatenate([wall + pillars, (floor - ceiling)[None]])
     # the field says where to, never how fast
-    return settings.evader_speed * force / (length(force) + EPSILON)
+    size = length(force)
+    return settings.evader_speed * force / (size + EPSILON)
 
 
 def _norm_squared(vector: jax.Array) -> jax.Array:
