@@ -1,5 +1,9 @@
-"""A search over plans of an evader: sequences of held velocities, each tried in a copy of
-its world, in which the pursuers answer as they will.
+"""The search over plans: candidates of one side are tried, and the one that is worth most
+to it is taken, against the worst of the other side's answers where it has several
+(`best_of`). A team's plans are those of `openjax.learning.team_plans`.
+
+An evader's are sequences of held velocities, each tried in a copy of its world, in which
+the pursuers answer as they will.
 
 The best plan is the one in which the evader is free longest; of those the one at whose
 end it has most room. A judge's evader flies the beginning of it
@@ -10,7 +14,7 @@ the search doesn't share the blind spots of evaders that learn.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +22,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from openjax.learning.settings import PlanSettings
 from openjax.pursuit import Observation, PursuitSettings, PursuitState
+from openjax.pursuit.shapes import Scalar
 from openjax.vehicle.vectors import unit
 
 World = tuple[Observation, PursuitState]
@@ -48,8 +53,7 @@ class Trials(NamedTuple):
     @property
     def best(self) -> Plan:
         """The plan of each world that promises its evader most."""
-        place = jnp.argmax(self.promise, axis=1)
-        return jnp.take_along_axis(self.plans, place[:, None, None, None], axis=1)[:, 0]
+        return jax.vmap(best_of)(self.plans, self.promise)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,6 +172,15 @@ class PlanSearch:
         """
         newly = end.statistics.captured & ~start.statistics.captured
         return jnp.where(newly, end.statistics.capture_step - start.step, self.settings.steps)
+
+
+def best_of(plans: Any, worth: jax.Array) -> tuple[Any, Scalar]:
+    """Of plans (P, ...) the one whose worth (P,) to the side that tries them is largest, and
+    that worth (); where it differs with A answers of the other side, (P, A), the least counts.
+    """
+    least = jnp.min(worth.reshape(worth.shape[0], -1), axis=1)
+    place = jnp.argmax(least)
+    return jax.tree.map(lambda leaf: leaf[place], plans), least[place]
 
 
 def shifted_plan(plan: Plan) -> Plan:

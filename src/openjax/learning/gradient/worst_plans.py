@@ -42,7 +42,7 @@ from openjax.learning.gradient.stage import (
 )
 from openjax.learning.plan_search import Plan, PlanSearch, Trials, shifted_plan
 from openjax.learning.settings import GeneratorSettings, PlanSettings, WorstPlansSettings
-from openjax.learning.team_search import STEP, TeamPlan, TeamSearch, no_plan
+from openjax.learning.team_plans import STEP, TeamPlan, TeamPlans, no_plan
 from openjax.policy import PolicyParameters
 from openjax.pursuit import Pursuit, PursuitSettings, PursuitState
 from openjax.pursuit.rows import where_rows
@@ -141,10 +141,10 @@ class WorstPlans:
         return PlanSearch(plans, self.game, constant=(0.0, np.nan))
 
     @functools.cached_property
-    def team(self) -> TeamSearch:
+    def team(self) -> TeamPlans:
         """What a team could do."""
         seconds = self.search.settings.steps * self.game.time_step
-        return TeamSearch(self.game, self.planning.TEAM_PLANS, seconds)
+        return TeamPlans(self.game, self.planning.TEAM_PLANS, seconds)
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
@@ -220,7 +220,7 @@ class WorstPlans:
         task = world[1].task
         velocities = self._velocities(task, pick(trials.plans))
         keys = jax.random.split(key, plan.shape[0])
-        best, promise = jax.vmap(team.search)(world[1], paths, velocities, team_plan, keys)
+        best, promise = jax.vmap(team.best)(world[1], paths, velocities, team_plan, keys)
         gain = jnp.max(pick(worth), axis=1) - promise
         way = jax.vmap(team.way)(world[1], paths, best, self._velocities(task, plan))
         ends_of_pieces = np.arange(1, self.planning.PIECES + 1) * team.steps // self.planning.PIECES

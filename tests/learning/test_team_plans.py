@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.learning.team_search import ACCELERATION, STEP, TeamSearch, no_plan
+from openjax.learning.team_plans import ACCELERATION, STEP, TeamPlans, no_plan
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, scenario_task
 
 GAME = PursuitSettings(max_pillars=6)
-SEARCH = TeamSearch(GAME, plans=7, seconds=0.6)
+PLANS = TeamPlans(GAME, plans=7, seconds=0.6)
 
 
 @pytest.fixture(scope="module")
@@ -22,20 +22,20 @@ def wall():
     task = task.replace(evader_position=jnp.array([-0.35, 0.0, 0.6]))
     _, state = jax.jit(Pursuit(GAME).reset_to)(jax.random.key(0), task)
     ways = jax.random.normal(jax.random.key(1), (3, 1, 3))
-    return state, jnp.broadcast_to(ways, (3, SEARCH.steps, 3))
+    return state, jnp.broadcast_to(ways, (3, PLANS.steps, 3))
 
 
 def test_the_best_plan_is_best_against_the_worst_answer(wall):
     state, velocities = wall
     key = jax.random.key(2)
-    paths = SEARCH.paths(state.task)
-    best, worth = jax.jit(SEARCH.search)(state, paths, velocities, no_plan(3), key)
-    teams = SEARCH.candidates(key, no_plan(3))
+    paths = PLANS.paths(state.task)
+    best, worth = jax.jit(PLANS.best)(state, paths, velocities, no_plan(3), key)
+    teams = PLANS.candidates(key, no_plan(3))
 
     @jax.jit
     def payoff_of(team, velocity):
-        end = SEARCH.fly(state.task, paths, SEARCH.start(state), team, velocity)[0]
-        return SEARCH.payoff(state.task, paths, end)
+        end = PLANS.fly(state.task, paths, PLANS.start(state), team, velocity)[0]
+        return PLANS.payoff(state.task, paths, end)
 
     payoff = np.zeros((7, 3))
     for i, j in itertools.product(range(7), range(3)):
@@ -49,7 +49,7 @@ def test_the_best_plan_is_best_against_the_worst_answer(wall):
 def test_points_are_no_faster_than_quadrotors(wall):
     state, velocities = wall
     places = np.asarray(
-        jax.jit(SEARCH.way)(state, SEARCH.paths(state.task), no_plan(3), velocities[0])
+        jax.jit(PLANS.way)(state, PLANS.paths(state.task), no_plan(3), velocities[0])
     )
     velocity = np.diff(places, axis=0) / STEP
     assert np.linalg.norm(velocity, axis=-1).max() <= GAME.max_speed + 1e-4
@@ -59,9 +59,9 @@ def test_points_are_no_faster_than_quadrotors(wall):
 
 def test_a_team_catches_who_stays_behind_a_wall(wall):
     state, _ = wall
-    search = dataclasses.replace(SEARCH, seconds=1.6)
-    stays = jnp.zeros((1, search.steps, 3))
-    _, worth = jax.jit(search.search)(
-        state, search.paths(state.task), stays, no_plan(3), jax.random.key(3)
+    longer = dataclasses.replace(PLANS, seconds=1.6)
+    stays = jnp.zeros((1, longer.steps, 3))
+    _, worth = jax.jit(longer.best)(
+        state, longer.paths(state.task), stays, no_plan(3), jax.random.key(3)
     )
-    assert float(worth) < search.steps
+    assert float(worth) < longer.steps

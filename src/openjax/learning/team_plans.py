@@ -6,10 +6,8 @@ none of three who stand round an evader gains by going first. A search over plan
 whole team doesn't. Here the pursuers are points that turn and brake as quadrotors can,
 so that 600 pairs of plans cost less than flying the networks against 32; the team plan
 that is best against the evader's best answer is the one to learn from (a matrix game,
-in which the evader chooses last).
-
-It answers the plans of `openjax.learning.plan_search`, which judges use, too; no judge
-knows of the team's.
+in which the evader chooses last; `openjax.learning.plan_search.best_of`). No judge knows
+of the team's plans.
 """
 
 import dataclasses
@@ -21,6 +19,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from openjax.learning.plan_search import best_of
 from openjax.pursuit import PursuitSettings, PursuitState
 from openjax.pursuit.collisions import breaches
 from openjax.pursuit.evaders.behaviours import into_free_space
@@ -105,8 +104,8 @@ class Points:
 
 
 @dataclass(frozen=True)
-class TeamSearch:
-    """The number of plans that a team tries, and their reach."""
+class TeamPlans:
+    """The number of plans that a team tries, their reach, and their worth."""
 
     game: PursuitSettings
     plans: int = 48
@@ -255,7 +254,7 @@ class TeamSearch:
             drones.position, drones.velocity, state.evader_position, jnp.zeros((), bool), none, none
         )
 
-    def search(
+    def best(
         self,
         state: PursuitState,
         paths: ShortestPaths,
@@ -274,9 +273,9 @@ class TeamSearch:
             return self.payoff(task, paths, self.fly(task, paths, start, team, velocity)[0])
 
         payoff = jax.vmap(jax.vmap(pair, (None, 0)), (0, None))(teams, velocities)
-        worth = jnp.max(payoff, axis=1)
-        best = jnp.argmin(worth)
-        return jax.tree.map(lambda leaf: leaf[best], teams), worth[best]
+        # what the evader wins the team loses
+        best, worth = best_of(teams, -payoff)
+        return best, -worth
 
     def way(self, state: PursuitState, paths: ShortestPaths, plan: TeamPlan, velocity) -> Places:
         """Where the pursuers of one world are after each step of a plan against the
