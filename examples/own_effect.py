@@ -34,6 +34,6 @@ tether = Effect(
 register_effect(tether)  # before the diagnosis is loaded, which is when it is first asked
 
 folder = Path(tempfile.mkdtemp()) / "tether"
-sample_flights.make_case(sample_flights.Arguments(folder, effect=("tether",)))
+sample_flights.make_case(sample_flights.SampleFlightsCommand(folder, effect=("tether",)))
 report = gap.diagnose_case(gap.load_case(folder))
 print("\n".join(report.in_words()))

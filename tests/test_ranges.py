@@ -47,11 +47,11 @@ COMMANDS = (
     EvaluateCommand,
     TrainCommand,
     ViewCommand,
-    export.Arguments,
-    fly.Arguments,
-    virtual_crazyflie.Arguments,
+    export.ExportCommand,
+    fly.FlyCommand,
+    virtual_crazyflie.VirtualCrazyflieCommand,
 )
-OF_FLIGHTS = (calibrate.Arguments, diagnose.Options, sample_flights.Arguments)
+OF_FLIGHTS = (calibrate.CalibrateCommand, diagnose.Options, sample_flights.SampleFlightsCommand)
 """They can't be made without a folder."""
 FIELDS = [(kind, field) for kind in (*SETTINGS, *COMMANDS) for field in ranged_fields(kind)]
 

@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.table import Page, Table, page_parser, publish
-from openjax.commands.sample_flights import Arguments, make_case
+from openjax.commands.sample_flights import SampleFlightsCommand, make_case
 from openjax.files import read_json
 from openjax.flights.case import read_folder
 from openjax.flights.csv_table import write_csv
@@ -69,7 +69,7 @@ def sample_records(work: Path, seeds: list[int]) -> list[dict]:
         for effect in EFFECTS:
             folder = work / f"{effect}_{seed}"
             if not folder.exists():
-                make_case(Arguments(folder, effect=(effect,), seed=seed))
+                make_case(SampleFlightsCommand(folder, effect=(effect,), seed=seed))
     out = []
     for effect in EFFECTS:
         for seed, other in zip(seeds, [*seeds[1:], seeds[0]], strict=True):

@@ -13,7 +13,7 @@ import pytest
 import openjax
 from openjax.commands.play import main
 from openjax.commands.play_game import Moment, Simulation
-from openjax.commands.play_server import Table, play_server
+from openjax.commands.play_server import PlaySession, play_server
 from openjax.errors import UserError
 from openjax.pursuit import hover_action
 from openjax.pursuit.task import uniform_task
@@ -89,7 +89,7 @@ def page():
         games.append(ShortGame())
         return games[-1]
 
-    table = Table(begin, every=4)
+    table = PlaySession(begin, every=4)
     with play_server(table, 0) as server:
         server.daemon_threads = True
         threading.Thread(target=server.serve_forever, daemon=True).start()

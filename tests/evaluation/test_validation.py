@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from openjax.evaluation.episodes import summarise
 from openjax.evaluation.evaluator import Evaluator
-from openjax.evaluation.validation import Validation, far_tasks, selection_score, uniform_tasks
+from openjax.evaluation.validation import ValidationTasks, far_tasks, selection_score, uniform_tasks
 from openjax.learning import TrainSettings, build
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings, RewardSettings
@@ -69,7 +69,7 @@ def test_uniform_tasks_fly_as_they_would_alone():
     policy = build(run, environment).policy
     key = jax.random.key(1)
     parameters = jax.jit(lambda key: policy.init(key, environment.reset(key)[0]))(key)
-    validation = Validation(environment, policy, run.validation_episodes)
+    validation = ValidationTasks(environment, policy, run.validation_episodes)
     uniform, far = (kind.evaluation for kind in validation(parameters))
     rewarded = dataclasses.replace(
         game, max_pillars=6, reward=RewardSettings(smoothness=2.0, first_crash=5000.0, distance=3.0)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.commands.export import EACH, Arguments, export, observations
+from openjax.commands.export import EACH, ExportCommand, export, observations
 from openjax.errors import UserError
 from openjax.export.c_compiled import compile_c
 from openjax.export.c_program import DrawnStrategies, c_program
@@ -68,7 +68,7 @@ def test_the_file_acts_as_the_policy_does(policy_file, flown, tmp_path, monkeypa
     monkeypatch.setattr("openjax.commands.export.observations", lambda *_: dict(flown))
     if kind == "onnx":
         pytest.importorskip("onnxruntime", reason='the extra "export" is not installed')
-    report = export(Arguments(str(policy_file), kind, out=tmp_path, observations=64))
+    report = export(ExportCommand(str(policy_file), kind, out=tmp_path, observations=64))
     assert report["observations"] == 64
     assert report["largest_difference"] < 1e-5
     assert json.loads((tmp_path / f"{kind}.json").read_text())["output"]["action"] == [3, 4]
@@ -80,7 +80,7 @@ def test_the_file_acts_as_the_policy_does(policy_file, flown, tmp_path, monkeypa
 def test_a_name_in_no_encoding_is_exported(policy_file, flown, tmp_path, monkeypatch):
     monkeypatch.setattr("openjax.commands.export.observations", lambda *_: dict(flown))
     odd = shutil.copyfile(policy_file, os.fsdecode(os.fsencode(tmp_path) + b"/policy_\xff.npz"))
-    export(Arguments(str(odd), "c", out=tmp_path, observations=64))
+    export(ExportCommand(str(odd), "c", out=tmp_path, observations=64))
     assert "policy_\\udcff.npz" in (tmp_path / "policy.c").read_text()
 
 
@@ -126,7 +126,7 @@ def test_who_draws_a_strategy_is_said(mixed_file, flown, tmp_path, monkeypatch, 
         pytest.importorskip("onnxruntime", reason='the extra "export" is not installed')
     seen = flown | {"strategy": np.arange(64, dtype=np.int32) % 2}
     monkeypatch.setattr("openjax.commands.export.observations", lambda *_: seen)
-    export(Arguments(str(mixed_file), kind, out=tmp_path, observations=64))
+    export(ExportCommand(str(mixed_file), kind, out=tmp_path, observations=64))
     said = json.loads((tmp_path / f"{kind}.json").read_text())
     assert "strategy" in said["inputs"] and "0 to 1" in said["strategy"]
     assert (said["strategies"], said["strategy_seconds"], said["strategy_steps"]) == (2, 0.4, 40)

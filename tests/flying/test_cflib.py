@@ -25,7 +25,7 @@ from openjax.flying.crtp import Supervisor
 from openjax.flying.estimation import see
 from openjax.flying.flight_record import FlightRecord
 from openjax.flying.links import Links
-from openjax.flying.loop import Flight, Plan, flight_state
+from openjax.flying.loop import FlightLoop, FlightPlan, flight_state
 from openjax.flying.motion_capture import MotionCaptured
 from openjax.flying.raw_links import RawLinks
 from openjax.flying.recorder import NewCase, Recorder
@@ -149,7 +149,7 @@ class Hovering:
 def flight_of(links, seconds, **more):
     game = Hovering(links)
     state = flight_state(game, 3, PATIENT)
-    return Flight(links, game, state, Plan(episode_seconds=seconds), **more)
+    return FlightLoop(links, game, state, FlightPlan(episode_seconds=seconds), **more)
 
 
 def fly_hovering(uris, folder, body_logs, seconds):

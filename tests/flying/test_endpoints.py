@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from openjax.commands.fly import Arguments, check, fly
+from openjax.commands.fly import FlyCommand, check, fly
 from openjax.errors import UserError
 from openjax.flying.endpoints import endpoint_of, sole_command
 
@@ -35,7 +35,7 @@ FIRST = "udp://127.0.0.1:19850"
 def test_a_vehicle_is_the_same_however_it_is_written(uri, same):
     assert endpoint_of(uri).name == endpoint_of(same).name
     with pytest.raises(UserError, match="twice"):
-        check(Arguments(uri=(same, "udp://10.0.0.1:1"), evader_uri=uri))
+        check(FlyCommand(uri=(same, "udp://10.0.0.1:1"), evader_uri=uri))
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_a_second_fly_is_refused_first_of_all_until_the_first_is_gone(monkeypatc
     try:
         assert first.stdout.readline() == b"held\n"
         with pytest.raises(UserError, match="has this vehicle"):
-            fly(Arguments(uri=(free, "UDP://localhost:19981/")))
+            fly(FlyCommand(uri=(free, "UDP://localhost:19981/")))
         with sole_command([free]):  # what was held before the refusal is free again
             pass
     finally:

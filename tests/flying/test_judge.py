@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openjax.flying.controller import Pose, moved_on, nominal_airframe
-from openjax.flying.judge import Track, Verdict, agree, follows, judge, pose_limits
+from openjax.flying.judge import PoseHistory, Verdict, agree, follows, judge, pose_limits
 
 LIMITS = pose_limits(nominal_airframe(), 0.06)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -102,7 +102,7 @@ def test_what_a_vehicle_can_do_is_believed(push, spin, dt):
 
 
 def test_poses_out_of_order_late_or_from_the_future_change_nothing():
-    track = Track(HERE._replace(time=1.0))
+    track = PoseHistory(HERE._replace(time=1.0))
     for time in (0.99, 1.0, 0.5, 1.2, math.nan, math.inf):
         assert (
             track.update(
@@ -110,14 +110,16 @@ def test_poses_out_of_order_late_or_from_the_future_change_nothing():
             )
             is track
         )
-    assert Track().update(None, 1.0, LIMITS, True, None) == Track()
+    assert PoseHistory().update(None, 1.0, LIMITS, True, None) == PoseHistory()
 
 
 def test_a_refused_pose_leaves_the_last_good_one():
     wrong = HERE._replace(time=0.01, position=(2.0, 0.0, 0.5))
-    assert Track(HERE).update(wrong, 0.01, LIMITS, True, None) == Track(HERE, Verdict.JUMPED, 0.01)
+    assert PoseHistory(HERE).update(wrong, 0.01, LIMITS, True, None) == PoseHistory(
+        HERE, Verdict.JUMPED, 0.01
+    )
     assert (
-        Track(HERE).update(wrong, 0.01, LIMITS, False, None).pose is wrong
+        PoseHistory(HERE).update(wrong, 0.01, LIMITS, False, None).pose is wrong
     )  # carried to another place by hand
 
 

@@ -14,7 +14,7 @@ from openjax.flying import ticks
 from openjax.flying.controller import GRAVITY, Pose, nominal_airframe
 from openjax.flying.flight_record import FlightRecord
 from openjax.flying.game import Play
-from openjax.flying.loop import Flight, Plan, flight_state
+from openjax.flying.loop import FlightLoop, FlightPlan, flight_state
 from openjax.flying.state import Mode, PoseSample, SafetySettings
 from openjax.flying.ticks import PATIENCE, await_poses
 
@@ -79,7 +79,7 @@ class Hovering:
 def flight():
     """In the middle of a game, and a function that goes on for some ticks."""
     links = Hovering()
-    flight = Flight(links, links, flight_state(links, 3, SafetySettings()), Plan())
+    flight = FlightLoop(links, links, flight_state(links, 3, SafetySettings()), FlightPlan())
 
     def go_on(ticks):
         for _ in range(ticks):
@@ -120,7 +120,7 @@ def test_poses_that_are_never_of_now_end_a_flight_that_hasnt_begun():
     says why.
     """
     links = Hovering()
-    flight = Flight(links, links, flight_state(links, 3, SafetySettings()), Plan())
+    flight = FlightLoop(links, links, flight_state(links, 3, SafetySettings()), FlightPlan())
     begin = time.perf_counter()
     for k in range(0, 2200, 100):
         flight.tick(begin + 0.01 * k, begin)

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from openjax.errors import UserError
 from openjax.files import check_room
 from openjax.flights.csv_table import read_csv
-from openjax.flying.flight_files import CaseFolder, GameLog, Samples
-from openjax.flying.record_pipe import Kind, Teller
+from openjax.flying.flight_files import CaseFolder, GameLog, VehicleSamples
+from openjax.flying.record_pipe import RecordKind, Teller
 from openjax.flying.recorder import NewCase, Recorder
 from openjax.flying.set_point import RATES
 
@@ -54,7 +54,7 @@ def samples_of(seconds):
         [times, 4.0 + 0 * times, times, np.sin(np.outer(times, np.arange(1, 14)))]
     )
     bodies = np.column_stack([times + 0.002, np.cos(np.outer(times, np.arange(1, 11)))])
-    return Samples(poses, bodies, np.zeros((0, 14)))
+    return VehicleSamples(poses, bodies, np.zeros((0, 14)))
 
 
 def whole(tmp_path, cuts):
@@ -89,11 +89,11 @@ def test_who_tells_never_waits_for_a_recorder_that_is_stuck():
     teller = Teller(os.fdopen(writer, "wb"))
     row = tuple(float(k) for k in range(16))
     for _ in range(10_000):  # some megabytes: no pipe holds as much
-        teller.row(Kind.POSES, 0, row)
+        teller.row(RecordKind.POSES, 0, row)
     os.set_blocking(reader, False)
     got = b""
     while len(got) < 10_000 * (12 + 128):
-        teller.tell(Kind.END, 0, b"")  # goes on with what was left
+        teller.tell(RecordKind.END, 0, b"")  # goes on with what was left
         got += os.read(reader, 1 << 20)
     assert got.count(np.array(row).tobytes()) == 10_000
 

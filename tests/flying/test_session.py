@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("cflib", reason='the extra "fly" is not installed')
 
-from openjax.commands.fly import Arguments, Prepared
+from openjax.commands.fly import FlyCommand, Prepared
 from openjax.files import read_json
 from openjax.flights.csv_table import read_csv
 from openjax.flying.controller import nominal_airframe
@@ -74,7 +74,7 @@ def flying():
         {"policy": "level", "scenario": "wall", "uris": uris},
     )
     yield lambda number, kind, out=None: Flown(
-        number, kind, virtual, Arguments(uri=uris, episode_seconds=8.0, out=out), prepared
+        number, kind, virtual, FlyCommand(uri=uris, episode_seconds=8.0, out=out), prepared
     ).fly()
     virtual.close()
 

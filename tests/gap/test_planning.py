@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from openjax.commands.plan import Arguments, make_plan
+from openjax.commands.plan import PlanCommand, make_plan
 from openjax.errors import UserError
 from openjax.flights.plans import plan_of, read_plan, write_plan
 from openjax.flights.segments import LOWEST, SEGMENTS
@@ -69,7 +69,7 @@ def test_a_report_asks_for_the_flight_that_the_plan_puts_first(tmp_path):
     vehicle = load_vehicle_file(case)
     report = between("rotor_drag", "wind") | {"vehicle": str(vehicle.path)}
     (case / "report.json").write_text(json.dumps(report))
-    first = make_plan(Arguments(str(case), out=tmp_path / "plan"))[0]
+    first = make_plan(PlanCommand(str(case), out=tmp_path / "plan"))[0]
     assert next_flight(report, vehicle) == first
     assert first.startswith("Fly")
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.commands.sample_flights import Arguments, make_case
+from openjax.commands.sample_flights import SampleFlightsCommand, make_case
 from openjax.errors import UserError
 from openjax.flights.flight import Case, Issue
 from openjax.gap.channels import Estimated
@@ -150,7 +150,7 @@ def test_days_of_a_reference_are_joined_and_another_vehicle_is_refused():
 @pytest.mark.slow
 def test_a_slower_motor_is_named_and_one_that_was_as_slow_before_is_no_change(tmp_path):
     def flown(name, seed, effects):
-        arguments = Arguments(tmp_path / name, effect=effects or ("none",), seed=seed)
+        arguments = SampleFlightsCommand(tmp_path / name, effect=effects or ("none",), seed=seed)
         make_case(arguments)
         return tmp_path / name
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from openjax.commands.sample_flights import Arguments, make_case
+from openjax.commands.sample_flights import SampleFlightsCommand, make_case
 from openjax.gap.channels import Estimated
 from openjax.gap.diagnosis import _runner_up, forbidden
 from openjax.gap.folders import diagnose_folder
@@ -199,9 +199,9 @@ def test_reports_of_flights_with_every_effect_agree_with_themselves(tmp_path):
     """What is generated, not made up: a report of each effect, alone and with another
     day's flights as the reference.
     """
-    make_case(Arguments(tmp_path / "before", seed=1))
+    make_case(SampleFlightsCommand(tmp_path / "before", seed=1))
     for number, effect in enumerate(("none", *EFFECTS)):
-        make_case(Arguments(tmp_path / effect, effect=(effect,), seed=2 + number))
+        make_case(SampleFlightsCommand(tmp_path / effect, effect=(effect,), seed=2 + number))
         # every fourth beside another day, too
         days = [(), (tmp_path / "before",)]
         for reference in days[: 1 + (number % 4 == 0)]:

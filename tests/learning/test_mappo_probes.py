@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from openjax.errors import UserError
-from openjax.learning.learners.learner import Flown
+from openjax.learning.learners.learner import Experience
 from openjax.learning.learners.mappo import Mappo, every_nth, follow_kl, make_optimiser
 from openjax.learning.presets import preset
 from openjax.learning.rollout import Rollout
@@ -93,7 +93,7 @@ def one_update(learner, probe, carry, key):
         evader=jnp.zeros((STEPS, WORLDS, 3)),
     )
     last = observation_of(flag[-1], jnp.ones(WORLDS))
-    flown = Flown(rollout, frames=None, observation=last, state=None, predicted=None)
+    flown = Experience(rollout, frames=None, observation=last, state=None, predicted=None)
     state, parameters, metrics = learner.learn(state, parameters, flown, shuffle_key)
     return (state, parameters), metrics
 

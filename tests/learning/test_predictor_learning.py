@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.learning.learners.learner import Flown
+from openjax.learning.learners.learner import Experience
 from openjax.learning.learners.predictor_update import (
     PredictorLearner,
     make_predictor_optimiser,
     prediction_loss,
     windows_and_labels,
 )
-from openjax.learning.rollout import Noise, Players, Rollout, collect
+from openjax.learning.rollout import ExplorationNoise, Players, Rollout, collect
 from openjax.policy import (
     NetworkSettings,
     Policy,
@@ -52,7 +52,9 @@ def recorded():
     def play(parameters, observation, state, key, share):
         noise = jax.random.normal(key, (STEPS, WORLDS, GAME.num_pursuers, 4))
         players = Players(environment, policy, parameters)
-        rollout, last, after = collect(players, (observation, state), Noise(noise), share)
+        rollout, last, after = collect(
+            players, (observation, state), ExplorationNoise(noise), share
+        )
 
         def one(carry, action):
             observation, state = carry
@@ -190,7 +192,7 @@ def test_learns_a_circling_evader():
         state, parameters = carry
         data_key, window_key = jax.random.split(key)
         earlier, rollout = rollout_of(data_key)
-        flown = Flown(rollout, earlier, observation=None, state=None, predicted=None)
+        flown = Experience(rollout, earlier, observation=None, state=None, predicted=None)
         state, parameters, metrics = learner.learn(state, parameters, flown, window_key)
         return (state, parameters), metrics["predictor_loss"]
 

@@ -10,7 +10,7 @@ import pytest
 from openjax.flights.case import load_case
 from openjax.flying.controller import nominal_airframe
 from openjax.flying.crtp import compress_quaternion, expand_quaternion
-from openjax.flying.flight_files import GameLog, Samples
+from openjax.flying.flight_files import GameLog, VehicleSamples
 from openjax.flying.set_point import RATES, SetPoint
 from openjax.vehicle import load_vehicle
 from openjax.virtual_crazyflie.firmware import STEP
@@ -89,7 +89,7 @@ def flown(folder, seed: int, seconds: float):
                     poses[i].append((moment, 4.0, moment, *place, *attitude, *sensed[3:]))
             vehicles.advance(command, 1)
     samples = [
-        Samples(np.array(p), np.array(b), np.zeros((0, 14)))
+        VehicleSamples(np.array(p), np.array(b), np.zeros((0, 14)))
         for p, b in zip(poses, bodies, strict=True)
     ]
     log = GameLog(0)

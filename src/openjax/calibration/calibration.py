@@ -77,7 +77,7 @@ _ASSUMED_MASS = "for the assumed mass, which wasn't weighed"
 
 
 @dataclass(frozen=True)
-class Quantity:
+class FittedConstant:
     """A fitted constant: value, 90 % interval and nominal value, each a tuple of length
     1 (3 for inertia).
     """
@@ -95,7 +95,7 @@ class Quantity:
 class Calibration:
     """Result of a calibration."""
 
-    quantities: dict[str, Quantity]
+    quantities: dict[str, FittedConstant]
     cannot_tell: tuple[str, ...]
     """What these flights leave open, in words."""
     nuisances: dict[str, tuple[float, str]] = field(default_factory=dict)
@@ -186,7 +186,7 @@ def logarithms(theta: np.ndarray, vehicle, duty_cycles: bool) -> dict[str, np.nd
     return {name: np.log(np.maximum(values, 1e-3)) for name, values in estimates.items()}
 
 
-def _quantities(evidence: Evidence, fit: SetFit, rates_fit: bool) -> dict[str, Quantity]:
+def _quantities(evidence: Evidence, fit: SetFit, rates_fit: bool) -> dict[str, FittedConstant]:
     file = evidence.case.vehicle_file
     vehicle = evidence.vehicles[0]
     duty_cycles = file.motor.command == "pwm"
@@ -231,7 +231,7 @@ def _slopes(fit: SetFit, vehicle, duty_cycles: bool) -> dict[str, np.ndarray]:
 
 def _quantity(
     name: str, vehicle, logs: np.ndarray, deviations: np.ndarray, is_determined: bool
-) -> Quantity:
+) -> FittedConstant:
     nominal = np.atleast_1d(np.asarray(getattr(vehicle, name), float))
     value = nominal.copy()
     # of the inertia x and y are fitted; z stays nominal, in the range in which it may
@@ -247,7 +247,7 @@ def _quantity(
         "inertia": "zz is assumed nominal",
         "torque_constant": "for the nominal inertia about z",
     }
-    return Quantity(
+    return FittedConstant(
         value=tuple(value.tolist()),
         interval90=tuple(pairs),
         nominal=tuple(nominal.tolist()),
@@ -258,7 +258,7 @@ def _quantity(
 
 
 def _cannot_tell(
-    evidence: Evidence, fit: SetFit, quantities: dict[str, Quantity], share: float
+    evidence: Evidence, fit: SetFit, quantities: dict[str, FittedConstant], share: float
 ) -> list[str]:
     """A sentence on what these flights leave open. `share` of the rates' changes that the fitted
     vehicle explains.

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Iterator
 
-from openjax.cluster.processes import Connection, Processes, encode
+from openjax.cluster.processes import Peer, Processes, encode
 from openjax.errors import UserError
 
 JOIN = 300.0
@@ -240,7 +240,7 @@ def _call(host, port, membership):
             connection.settimeout(max(deadline - time.monotonic(), 1.0))
             reader = connection.makefile("rb")
             if welcome := reader.readline(LINE):
-                return Connection(connection, reader, json.loads(welcome)["host"])
+                return Peer(connection, reader, json.loads(welcome)["host"])
         except OSError as error:
             reason = str(error.strerror or error)
         if time.monotonic() > deadline:
@@ -253,7 +253,7 @@ def _call(host, port, membership):
 
 def _accept(server, number):
     """Connections to all others, by process."""
-    others: dict[int, Connection] = {}
+    others: dict[int, Peer] = {}
     deadline = time.monotonic() + JOIN
     while len(others) < number - 1:
         server.settimeout(max(deadline - time.monotonic(), 0.01))
@@ -271,7 +271,7 @@ def _accept(server, number):
             greeting = json.loads(reader.readline(LINE))
             other = greeting["process"]
             if greeting["of"] == number and 1 <= other < number and other not in others:
-                others[other] = Connection(connection, reader, str(greeting["host"]))
+                others[other] = Peer(connection, reader, str(greeting["host"]))
                 continue
         connection.close()
     # only now: the welcome tells each that all have come

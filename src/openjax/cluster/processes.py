@@ -26,8 +26,8 @@ GRACE = 5.0
 """Seconds that a process has to end by itself when another one failed."""
 
 
-class Connection(NamedTuple):
-    """An open connection to another process."""
+class Peer(NamedTuple):
+    """Another process, and the open connection to it."""
 
     socket: socket.socket
     reader: BinaryIO
@@ -44,9 +44,7 @@ class Processes:
       advice: says what to do now, when another process is lost.
     """
 
-    def __init__(
-        self, number: int = 1, index: int = 0, connections: dict[int, Connection] | None = None
-    ):
+    def __init__(self, number: int = 1, index: int = 0, connections: dict[int, Peer] | None = None):
         """`connections` by process: to all others on process 0, to process 0
         elsewhere.
         """
@@ -143,7 +141,7 @@ class _Link:
     directions.
     """
 
-    def __init__(self, job: Processes, other: int, connection: Connection):
+    def __init__(self, job: Processes, other: int, connection: Peer):
         self._job = job
         self._other = other
         self._host = connection.host

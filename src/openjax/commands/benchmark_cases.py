@@ -17,14 +17,14 @@ from openjax.commands.options import BenchmarkCommand
 from openjax.errors import UserError
 from openjax.evaluation.validation import uniform_tasks
 from openjax.learning import TrainSettings, build, make_start, training_step
-from openjax.learning.rollout import Noise, Players, collect
+from openjax.learning.rollout import ExplorationNoise, Players, collect
 from openjax.pursuit import Pursuit, hover_action
 from openjax.pursuit.environment import action_to_command
 from openjax.store.leaves import place
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 
 
-class Case(NamedTuple):
+class Workload(NamedTuple):
     """A case to be timed."""
 
     name: str
@@ -35,7 +35,7 @@ class Case(NamedTuple):
     arguments: tuple
 
 
-def cases(command: BenchmarkCommand, part: str, num_envs: int) -> Iterator[Case]:
+def cases(command: BenchmarkCommand, part: str, num_envs: int) -> Iterator[Workload]:
     """The cases of a part, made one at a time: together they wouldn't fit into
     memory.
     """
@@ -45,7 +45,7 @@ def cases(command: BenchmarkCommand, part: str, num_envs: int) -> Iterator[Case]
         for number in command.devices:
             fitting = fitting_settings(settings, num_envs, number)
             for name, function, arguments in _training(fitting, number):
-                yield Case(name, fitting.num_envs, fitting.rollout_length, function, arguments)
+                yield Workload(name, fitting.num_envs, fitting.rollout_length, function, arguments)
         return
     if part == "rollout":
         function, arguments = _rollout(settings, num_envs, steps)
@@ -53,7 +53,7 @@ def cases(command: BenchmarkCommand, part: str, num_envs: int) -> Iterator[Case]
         function, arguments = _environment(settings, num_envs, steps)
     else:
         function, arguments = _physics(part, settings, num_envs, steps)
-    yield Case(part, num_envs, steps, function, arguments)
+    yield Workload(part, num_envs, steps, function, arguments)
 
 
 def _training(settings, devices):
@@ -150,7 +150,9 @@ def _rollout(settings, num_envs, steps):
     def run(parameters, observation, state, key):
         shape = (steps, num_envs, settings.environment.num_pursuers, parts.policy.sample_size)
         players = Players(environment, parts.policy, parameters)
-        return collect(players, (observation, state), Noise(jax.random.normal(key, shape)))
+        return collect(
+            players, (observation, state), ExplorationNoise(jax.random.normal(key, shape))
+        )
 
     return run, (parameters, observation, state, jax.random.key(2))
 
@@ -172,7 +174,7 @@ class Timing:
     """
 
 
-def time_compiled(case: Case, min_seconds: float) -> Timing:
+def time_compiled(case: Workload, min_seconds: float) -> Timing:
     """Compile a case's function, run it once to warm up, then time three calls or more,
     for at least `min_seconds`.
 

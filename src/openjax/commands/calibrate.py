@@ -25,7 +25,7 @@ SECONDS = 15.0
 
 
 @dataclass(frozen=True)
-class Arguments:
+class CalibrateCommand:
     """Fit thrust and torque constants, motor lag and inertia to a case's flights."""
 
     case: Annotated[Path, tyro.conf.Positional]
@@ -36,7 +36,7 @@ class Arguments:
     """Replace the file if it exists."""
 
 
-def run(arguments: Arguments, console: Console):
+def run(arguments: CalibrateCommand, console: Console):
     """Calibrate, print and write; returns the Calibration. Raises UserError; writes
     nothing then.
     """
@@ -111,5 +111,5 @@ def _print(result, console: Console) -> None:
 
 def main(arguments: Sequence[str]) -> None:
     """The command. Raises UserError for a case that can't be read or calibrated."""
-    options = parse(Arguments, Arguments(case=tyro.MISSING), arguments, PROGRAM)
+    options = parse(CalibrateCommand, CalibrateCommand(case=tyro.MISSING), arguments, PROGRAM)
     run(options, output_console())

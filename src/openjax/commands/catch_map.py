@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.baselines.stack import planar_bound, stack_bound
-from openjax.commands.map_evaders import Flight, MapEvaders, least_caught
+from openjax.commands.map_evaders import EvaderFlights, MapEvaders, least_caught
 from openjax.commands.options import MapCommand
 from openjax.errors import UserError
 from openjax.evaluation.episodes import wilson
@@ -219,7 +219,7 @@ class _Flyer:
     """(key, cell (3,)) -> a task in it"""
     tell: Callable[[str], None]
 
-    def fly(self, flight: Flight, cells: Sequence[Cell]) -> list[EpisodeStatistics]:
+    def fly(self, flight: EvaderFlights, cells: Sequence[Cell]) -> list[EpisodeStatistics]:
         """The statistics (episodes, ...) of each cell."""
         command = self.command
         episodes = flight.episodes

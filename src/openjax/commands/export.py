@@ -42,7 +42,7 @@ EACH = (
 
 
 @dataclass(frozen=True)
-class Arguments:
+class ExportCommand:
     """Write a policy as ONNX, as a serialised JAX function, or as C."""
 
     policy: str = DEFAULT_POLICY
@@ -104,7 +104,7 @@ def observations(policy, number: int, seed: int) -> dict:
     return fields
 
 
-def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None) -> dict:
+def export(arguments: ExportCommand, tell: Callable[[str], None] = lambda step: None) -> dict:
     """Write the files; returns what FORMAT.json says. `tell` hears the steps. Raises
     UserError if it can't be, or differs.
     """
@@ -284,7 +284,7 @@ def _c(act, inputs, samples, about):
 
 def main(arguments: Sequence[str]) -> None:
     """The command. Raises UserError for an unusable policy or folder."""
-    options = parse(Arguments, Arguments(), arguments, PROGRAM)
+    options = parse(ExportCommand, ExportCommand(), arguments, PROGRAM)
     console = output_console()
     with Steps(f"exporting {options.policy}", STEPS, console) as steps:
         report = export(options, steps.begin)

@@ -31,7 +31,7 @@ DRIFT = 0.1
 
 
 @dataclass(frozen=True)
-class Arguments:
+class FlyCommand:
     """Fly a policy on as many Crazyflies as it has pursuers, and log it for the
     diagnosis.
 
@@ -96,10 +96,10 @@ class Arguments:
 
 def main(arguments: Sequence[str]) -> None:
     """The command. Raises UserError where nothing was flown."""
-    fly(parse(Arguments, Arguments(), arguments, PROGRAM))
+    fly(parse(FlyCommand, FlyCommand(), arguments, PROGRAM))
 
 
-def fly(arguments: Arguments, preparation: Prepared | None = None) -> None:
+def fly(arguments: FlyCommand, preparation: Prepared | None = None) -> None:
     """Fly. Raises UserError for what can't be, and where another process had to land
     the vehicles.
 
@@ -112,10 +112,10 @@ def fly(arguments: Arguments, preparation: Prepared | None = None) -> None:
         _fly(arguments, preparation)
 
 
-def _fly(arguments: Arguments, preparation: Prepared | None) -> None:
+def _fly(arguments: FlyCommand, preparation: Prepared | None) -> None:
     """Fly vehicles that are nobody else's."""
     console = output_console()
-    from openjax.flying.loop import Flight, Plan
+    from openjax.flying.loop import FlightLoop, FlightPlan
     from openjax.flying.session import Session
 
     if preparation is None:
@@ -127,8 +127,8 @@ def _fly(arguments: Arguments, preparation: Prepared | None) -> None:
     console.print(f"connecting to {', '.join(setup.session.uris)} ...")
     with Session(setup.session, setup.state, _case(arguments, setup)) as session:
         session.check()
-        plan = Plan(arguments.episodes, arguments.episode_seconds or math.inf)
-        flight = Flight(
+        plan = FlightPlan(arguments.episodes, arguments.episode_seconds or math.inf)
+        flight = FlightLoop(
             session.links,
             setup.game,
             setup.state,
@@ -171,7 +171,7 @@ class Prepared(NamedTuple):
     seconds: float = math.inf  # that it may take in the air
 
 
-def prepare(arguments: Arguments) -> Prepared:
+def prepare(arguments: FlyCommand) -> Prepared:
     """Policy, layout and vehicle, compiled; vehicles aren't needed for it."""
     from openjax.flying import real_time
     from openjax.flying.controller import airframe_of
@@ -221,7 +221,7 @@ def _draws(settings) -> dict:
     return {"strategies": settings.strategies, "strategy_seconds": seconds}
 
 
-def _prepare_plan(arguments: Arguments) -> Prepared:
+def _prepare_plan(arguments: FlyCommand) -> Prepared:
     """A plan in a policy's place."""
     from openjax.flights.manoeuvres import PERIOD
     from openjax.flights.plans import read_plan
@@ -241,7 +241,7 @@ def _prepare_plan(arguments: Arguments) -> Prepared:
     return Prepared(game, state, _session(arguments), vehicle, about, remarks, seconds)
 
 
-def _session(arguments: Arguments):
+def _session(arguments: FlyCommand):
     """The session's settings."""
     from openjax.flying.motion_capture import find_feed
     from openjax.flying.session import SessionSettings
@@ -257,13 +257,13 @@ def _session(arguments: Arguments):
     )
 
 
-def _longest_flight(arguments: Arguments, settings) -> float:
+def _longest_flight(arguments: FlyCommand, settings) -> float:
     """s that the games of this flight take at most."""
     length = settings.episode_length * settings.time_step
     return arguments.episodes * min(length, arguments.episode_seconds or math.inf)
 
 
-def _remarks(arguments: Arguments, settings, vehicle, seconds: float) -> tuple[str, ...]:
+def _remarks(arguments: FlyCommand, settings, vehicle, seconds: float) -> tuple[str, ...]:
     """Remarks to read before the vehicles rise."""
     remarks = _time_remark(arguments, seconds)
     if vehicle.airframe == settings.airframe:
@@ -272,7 +272,7 @@ def _remarks(arguments: Arguments, settings, vehicle, seconds: float) -> tuple[s
     return (other, *remarks)
 
 
-def _time_remark(arguments: Arguments, seconds: float) -> tuple[str, ...]:
+def _time_remark(arguments: FlyCommand, seconds: float) -> tuple[str, ...]:
     """What nobody notices in a flight of so many seconds by own estimates alone, and
     that it will be cut short, where it will.
     """
@@ -293,7 +293,7 @@ def _time_remark(arguments: Arguments, seconds: float) -> tuple[str, ...]:
     )
 
 
-def _case(arguments: Arguments, setup: Prepared):
+def _case(arguments: FlyCommand, setup: Prepared):
     """The case to be written, if one is to be; a flight for which there is no room
     raises UserError.
     """
@@ -333,17 +333,17 @@ def _check_numbers(arguments, starts, pursuers):
         )
 
 
-def uris_of(arguments: Arguments) -> tuple[str, ...]:
+def uris_of(arguments: FlyCommand) -> tuple[str, ...]:
     """The vehicles: pursuers, then the evader where it is one."""
     evader = () if arguments.evader_uri is None else (arguments.evader_uri,)
     return (*arguments.uri, *evader)
 
 
-def check(arguments: Arguments) -> Arguments:
+def check(arguments: FlyCommand) -> FlyCommand:
     """The arguments, their URIs as `cflib` wants them. Raises UserError."""
     if arguments.plan is not None:
-        if arguments.uri == Arguments.uri:  # as many as a policy has pursuers
-            arguments = dataclasses.replace(arguments, uri=Arguments.uri[:1])
+        if arguments.uri == FlyCommand.uri:  # as many as a policy has pursuers
+            arguments = dataclasses.replace(arguments, uri=FlyCommand.uri[:1])
         if len(uris_of(arguments)) != 1:
             raise UserError(
                 f"--plan flies one vehicle, --uri names {len(uris_of(arguments))}: name one"

@@ -24,7 +24,7 @@ from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 
 
 @dataclasses.dataclass(frozen=True)
-class Flight:
+class EvaderFlights:
     """Evaders of one kind, in whatever cells."""
 
     name: str
@@ -75,7 +75,7 @@ class MapEvaders:
         return BestResponse(command.learning, self.duel, draw_task)
 
     @property
-    def scripted(self) -> Flight:
+    def scripted(self) -> EvaderFlights:
         """Scripted ones, which know nothing of the team."""
         command = self.command
         evaluate = make_evaluate(Pursuit(self.game), self.loaded.policy, messages=command.messages)
@@ -83,7 +83,7 @@ class MapEvaders:
         def fly(parameters, tasks, key):
             return evaluate(parameters, tasks, key).statistics
 
-        return Flight("scripted evaders", fly, command.episodes, self.loaded.parameters)
+        return EvaderFlights("scripted evaders", fly, command.episodes, self.loaded.parameters)
 
     def learn(self, tell: Callable[[str], None]) -> tuple[Evaders, list[dict]]:
         """Learners after their training, and what was told on the way."""
@@ -95,7 +95,7 @@ class MapEvaders:
         looks = learn(self.command, programs, parameters, findings)
         return looks[max(looks)], findings.values["curve"]
 
-    def learned(self, evaders: Evaders) -> Flight:
+    def learned(self, evaders: Evaders) -> EvaderFlights:
         """Each learner's mean; statistics (B, L)."""
         duel = self.duel
         hold = self.command.learning.hold
@@ -106,7 +106,7 @@ class MapEvaders:
             results, _ = fly_learners(duel, hold, evaders, parameters, start)
             return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), results)
 
-        return Flight(
+        return EvaderFlights(
             "evaders that learned",
             fly,
             self.command.episodes,
@@ -115,7 +115,7 @@ class MapEvaders:
         )
 
     @property
-    def planned(self) -> Flight:
+    def planned(self) -> EvaderFlights:
         """The planner, in the first of a cell's episodes."""
         command = self.command
         planner = Planner(command.planning, self.duel)
@@ -126,7 +126,7 @@ class MapEvaders:
         episodes = min(command.planner_episodes, command.episodes)
         # wider than others, as nothing but the ends of its plans is kept
         width = -(-command.planning.plans // 4)
-        return Flight("an evader that plans", fly, episodes, self.loaded.parameters, width)
+        return EvaderFlights("an evader that plans", fly, episodes, self.loaded.parameters, width)
 
     def evaders(self, tell: Callable[[str], None]) -> tuple[Evaders, list[dict]]:
         """Those of the command's file, or new ones, and what was told while they

@@ -19,7 +19,7 @@ PROGRAM = "openjax mix"
 
 
 @dataclass(frozen=True)
-class Arguments:
+class MixCommand:
     """Make one policy of several: the team draws which of them it flies, and the evader
     isn't told (a mixed strategy).
 
@@ -47,7 +47,7 @@ class Arguments:
 
 def main(arguments: Sequence[str]) -> None:
     """The command. Raises UserError for policies that don't fit together."""
-    options = parse(Arguments, Arguments(policies=tyro.MISSING), arguments, PROGRAM)
+    options = parse(MixCommand, MixCommand(policies=tyro.MISSING), arguments, PROGRAM)
     check_output(options.out, "--out")
     if options.out.suffix != ".npz":
         raise UserError(f"--out {options.out}: a policy's file ends in .npz")

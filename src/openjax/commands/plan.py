@@ -14,7 +14,7 @@ PROGRAM = "openjax plan"
 
 
 @dataclass(frozen=True)
-class Arguments:
+class PlanCommand:
     """Rank segments of flight by what they are expected to tell about a diagnosis'
     causes.
 
@@ -37,14 +37,14 @@ class Arguments:
 def main(arguments: Sequence[str]) -> None:
     """The command. Raises UserError for a folder that holds no report."""
     one_thread_for_matrices()
-    options = parse(Arguments, Arguments(diagnosis=tyro.MISSING), arguments, PROGRAM)
+    options = parse(PlanCommand, PlanCommand(diagnosis=tyro.MISSING), arguments, PROGRAM)
     check_new_folder(options.out, "--out")
     console = output_console()
     for line in make_plan(options):
         console.print(line, soft_wrap=True)
 
 
-def make_plan(arguments: Arguments) -> list[str]:
+def make_plan(arguments: PlanCommand) -> list[str]:
     """Write the plan; what to say of it."""
     from openjax.flights.manoeuvres import PERIOD
     from openjax.flights.plans import STANDARD, plan_of, write_plan
@@ -81,7 +81,7 @@ def make_plan(arguments: Arguments) -> list[str]:
     ]
 
 
-def _advise(arguments: Arguments) -> tuple[str, list[dict], list[str]]:
+def _advise(arguments: PlanCommand) -> tuple[str, list[dict], list[str]]:
     """The sentence, the promises of all segments, and those to fly, for a diagnosis."""
     from openjax.gap.planning.beliefs import advice_for, read_report
     from openjax.vehicle.vehicle_file import load_vehicle_file

@@ -62,7 +62,7 @@ def make_table(command: PlayCommand):
     import jax
 
     from openjax.commands.play_game import Simulation
-    from openjax.commands.play_server import Table
+    from openjax.commands.play_server import PlaySession
     from openjax.pursuit import scenario_task
     from openjax.pursuit.task import uniform_task
 
@@ -86,4 +86,4 @@ def make_table(command: PlayCommand):
     first = jax.random.key(command.seed)
     simulation.begin(first).step((0.0, 0.0, 0.0))  # compiled before anybody waits for it
     every = max(1, round(LONGEST_STEP / settings.time_step))
-    return Table(lambda number: simulation.begin(jax.random.fold_in(first, number)), every)
+    return PlaySession(lambda number: simulation.begin(jax.random.fold_in(first, number)), every)

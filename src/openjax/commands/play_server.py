@@ -25,7 +25,7 @@ LONGEST_WISH = 200
 """Bytes of a message from the page."""
 
 
-class Table:
+class PlaySession:
     """The place where games are played one after the other: the threads of the page and of the game
     meet here.
 
@@ -152,14 +152,14 @@ def _frame(moment):
     }
 
 
-def play_page(table: Table) -> str:
+def play_page(table: PlaySession) -> str:
     """The replay's page, made live."""
     page = replay_page([(TITLE, table.game.trajectory(TITLE, steps=0))])
     script = LIVE.read_text(encoding="utf-8")
     return page.replace("</body>", f"<script>\n{script}</script>\n</body>")
 
 
-def play_server(table: Table, port: int) -> ThreadingHTTPServer:
+def play_server(table: PlaySession, port: int) -> ThreadingHTTPServer:
     """A server of the page, of the games' events, and of the last game's replay.
 
     Raises:
@@ -171,7 +171,7 @@ def play_server(table: Table, port: int) -> ThreadingHTTPServer:
 class _Handler(BaseHTTPRequestHandler):
     """Answers the pages of `table`, which a subclass names."""
 
-    table: Table
+    table: PlaySession
 
     def do_GET(self):
         if not self._is_ours():

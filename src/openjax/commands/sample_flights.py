@@ -26,7 +26,7 @@ _EFFECT_HELP = (
 
 
 @dataclass(frozen=True)
-class Arguments:
+class SampleFlightsCommand:
     """Fly openjax's own vehicle through three manoeuvres and write the logs as a
     case.
     """
@@ -40,7 +40,7 @@ class Arguments:
     """Random numbers: trajectories, noise, biases."""
 
 
-def make_case(arguments: Arguments) -> list[Path]:
+def make_case(arguments: SampleFlightsCommand) -> list[Path]:
     """Write the case; returns its files. Raises UserError for an unknown effect or a
     folder that isn't empty.
     """
@@ -92,7 +92,9 @@ def _checked_effects(names: tuple[str, ...], library: Collection[str]) -> tuple[
 
 def main(arguments: Sequence[str]) -> None:
     """The command. Raises UserError for an unknown effect or an unusable folder."""
-    options = parse(Arguments, Arguments(out=tyro.MISSING), arguments, PROGRAM)
+    options = parse(
+        SampleFlightsCommand, SampleFlightsCommand(out=tyro.MISSING), arguments, PROGRAM
+    )
     files = make_case(options)
     console = output_console()
     console.print(

@@ -26,7 +26,7 @@ MIDDLE = "middle"
 
 
 @dataclass(frozen=True)
-class Arguments:
+class VirtualCrazyflieCommand:
     """Fly virtual Crazyflies until interrupted; each has a port of its own."""
 
     number: Annotated[int, Interval("[1, 10]")] = 3
@@ -59,7 +59,7 @@ class Arguments:
     link: Annotated[LinkFaults, tyro.conf.arg(name="")] = field(default_factory=LinkFaults)
 
 
-def make(arguments: Arguments):
+def make(arguments: VirtualCrazyflieCommand):
     """The virtual Crazyflies, listening. Raises UserError for what can't be."""
     from openjax.pursuit import PursuitSettings, find_scenario
     from openjax.vehicle.effects import load_effects
@@ -83,7 +83,7 @@ def make(arguments: Arguments):
 
 def main(arguments: Sequence[str]) -> None:
     """The command; it runs until it is stopped."""
-    options = parse(Arguments, Arguments(), arguments, PROGRAM)
+    options = parse(VirtualCrazyflieCommand, VirtualCrazyflieCommand(), arguments, PROGRAM)
     from openjax.flying import real_time
 
     real_time.prepare()

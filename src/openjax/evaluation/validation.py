@@ -57,7 +57,7 @@ def far_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
     return _with_slots(jax.jit(jax.vmap(draw))(keys), slots)
 
 
-class Validation:
+class ValidationTasks:
     """A run's uniform and as many far tasks, flown in one call of one compiled
     evaluation; it has room for layouts' pillars.
 

@@ -22,7 +22,7 @@ from openjax.flights.mending import (
     mend,
 )
 from openjax.flights.motor_order import MOTORS, order_findings, torques_fit
-from openjax.flights.pairs import AGREE, Pair, Signals, pairs_of
+from openjax.flights.pairs import AGREE, SignalPair, Signals, pairs_of
 from openjax.flights.plausible import (
     copied_columns,
     gravity_findings,
@@ -98,7 +98,7 @@ def _contradictions(signals: Signals) -> list[Finding]:
     return [("garbage", pair.in_words(), [pair.what]) for pair in bad]
 
 
-def _other_quaternion(signals: Signals, pairs: list[Pair]) -> list[Finding]:
+def _other_quaternion(signals: Signals, pairs: list[SignalPair]) -> list[Finding]:
     """A convention of the quaternion by which the attitude turns with the gyroscope so
     much better that it was only the clocks' free offset that let the two agree: a turn
     to and fro, the wrong way round, is the right one half a period later.
@@ -117,7 +117,7 @@ def _other_quaternion(signals: Signals, pairs: list[Pair]) -> list[Finding]:
     return []
 
 
-def _unit(pair: Pair) -> list[Finding]:
+def _unit(pair: SignalPair) -> list[Finding]:
     """Columns of a pair that agrees but for its size, where a wrong unit explains
     that.
     """

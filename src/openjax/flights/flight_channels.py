@@ -5,10 +5,10 @@ that was logged, to be plotted.
 import numpy as np
 
 from openjax.flights.flight import CHANNEL_COLUMNS, Flight
-from openjax.show.foxglove import Channel, pose_channel
+from openjax.show.foxglove import Topic, pose_channel
 
 
-def flight_channels(flight: Flight) -> list[Channel]:
+def flight_channels(flight: Flight) -> list[Topic]:
     """The pose of a flight where it was logged, and its rows under the names of the log
     format; what wasn't sampled at a row is left out.
     """
@@ -22,7 +22,7 @@ def flight_channels(flight: Flight) -> list[Channel]:
         (float(time), {n: float(v[k]) for n, v in columns.items() if np.isfinite(v[k])})
         for k, time in enumerate(flight.time)
     ]
-    channels = [Channel(f"{name}/log", "openjax.LogRow", rows)]
+    channels = [Topic(f"{name}/log", "openjax.LogRow", rows)]
     if flight.position is not None:
         channels.append(
             pose_channel(f"{name}/pose", flight.time, flight.position, flight.quaternion)

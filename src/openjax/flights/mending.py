@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from openjax.flights.conventions import BODY, CONVENTIONS, FRAMES, upright
 from openjax.flights.flight import CHANNEL_COLUMNS
-from openjax.flights.pairs import WIDE, Pair, Signals, pairs_of
+from openjax.flights.pairs import WIDE, SignalPair, Signals, pairs_of
 from openjax.flights.plausible import gravity_findings
 from openjax.flights.signals import in_band, rates_of
 from openjax.flights.track import rotation, to_body
@@ -36,7 +36,7 @@ UPRIGHT = 0.5  # mean cosine of the tilt of whatever flies by thrust
 FOLLOWED = 0.7
 
 
-def agrees(signals: Signals, bad: list[Pair]) -> bool:
+def agrees(signals: Signals, bad: list[SignalPair]) -> bool:
     """True if with other `signals` no pair disagrees, and the `bad` ones clearly fit."""
     pairs = {pair.what: pair for pair in pairs_of(signals)}
     return all(pair.what in pairs and pairs[pair.what].fits for pair in bad) and not any(
@@ -44,7 +44,7 @@ def agrees(signals: Signals, bad: list[Pair]) -> bool:
     )
 
 
-def mend(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
+def mend(signals: Signals, bad: list[SignalPair]) -> tuple[str, str] | None:
     """Kind and words of a convention or labelling of one channel that makes the
     disagreeing pairs agree.
     """
@@ -69,7 +69,7 @@ def mend(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
     return None
 
 
-def convention_of(signals: Signals, bad: list[Pair]) -> str:
+def convention_of(signals: Signals, bad: list[SignalPair]) -> str:
     """Of another program's conventions one that makes the disagreeing pairs agree, in
     words.
     """
@@ -120,7 +120,7 @@ def _turns_with(signals: Signals, attitude: np.ndarray) -> bool:
     return float((attitude_rates * gyroscope_rates).sum()) > FOLLOWED * power
 
 
-def _relabel(signals: Signals, pair: Pair, bad: list[Pair]) -> str:
+def _relabel(signals: Signals, pair: SignalPair, bad: list[SignalPair]) -> str:
     """Which axes of a pair's channel hold what, if the best of all 48 labellings of it
     makes the disagreeing pairs agree.
     """

@@ -104,7 +104,7 @@ class Signals:
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class SignalPair:
     """`signal` (T, C) and what it must agree with, both in `unit`. `names` of the
     measured columns; `holds` the channel of `Signals` that they are, where another
     labelling of it may be right; `derivatives`: how many times each was differentiated
@@ -159,7 +159,7 @@ class Pair:
         )
 
 
-def pairs_of(s: Signals) -> Iterator[Pair]:
+def pairs_of(s: Signals) -> Iterator[SignalPair]:
     """All pairs that were logged."""
     yield from _derived_pairs(s)
     acceleration, order = s.acceleration
@@ -172,7 +172,7 @@ def pairs_of(s: Signals) -> Iterator[Pair]:
         yield from _felt(s, acceleration, along, order)
     yield from _caused_pairs(s, along, order)
     if s.commands is not None and s.rates is not None and not s.has_saturation:
-        yield Pair(
+        yield SignalPair(
             names=CHANNEL_COLUMNS["command_body_rates"],
             signal=s.commands,
             what="the body rates",
@@ -185,11 +185,11 @@ def pairs_of(s: Signals) -> Iterator[Pair]:
         )
 
 
-def _derived_pairs(s: Signals) -> Iterator[Pair]:
+def _derived_pairs(s: Signals) -> Iterator[SignalPair]:
     """Body rates with the attitude, and the velocity with the position."""
     attitude_rates = s.attitude_rates
     if attitude_rates is not None and s.body_rates is not None:
-        yield Pair(
+        yield SignalPair(
             names=CHANNEL_COLUMNS["body_rates"],
             signal=s.body_rates,
             what="the attitude's rate",
@@ -201,7 +201,7 @@ def _derived_pairs(s: Signals) -> Iterator[Pair]:
             holds="body_rates",
         )
     if s.position is not None and s.velocity is not None:
-        yield Pair(
+        yield SignalPair(
             names=CHANNEL_COLUMNS["velocity"],
             signal=s.velocity,
             what="the position's rate",
@@ -214,13 +214,15 @@ def _derived_pairs(s: Signals) -> Iterator[Pair]:
         )
 
 
-def _felt(s: Signals, acceleration: np.ndarray, along: np.ndarray, order: int) -> Iterator[Pair]:
+def _felt(
+    s: Signals, acceleration: np.ndarray, along: np.ndarray, order: int
+) -> Iterator[SignalPair]:
     """The path's acceleration with what an attitude and an accelerometer make of it;
     `along` (T, 1) is that along the body's z axis.
     """
     size = np.full(len(acceleration), GRAVITY) if s.force is None else s.force[:, 2]
     lift = rotation(s.quaternion)[:, :, 2] * np.median(size)
-    yield Pair(
+    yield SignalPair(
         names=("the path's acceleration in x", "in y"),
         signal=acceleration[:, :2],
         what="the attitude's thrust",
@@ -234,7 +236,7 @@ def _felt(s: Signals, acceleration: np.ndarray, along: np.ndarray, order: int) -
     if s.force is not None:
         # sideways the attitude tells how wrong the path's acceleration is
         off = in_band(acceleration[:, :2] - lift[:, :2], LOW).std(0).mean()
-        yield Pair(
+        yield SignalPair(
             names=("az",),
             signal=s.force[:, 2:],
             what="the path's acceleration",
@@ -246,7 +248,7 @@ def _felt(s: Signals, acceleration: np.ndarray, along: np.ndarray, order: int) -
         )
 
 
-def _caused_pairs(s: Signals, along: np.ndarray | None, order: int) -> Iterator[Pair]:
+def _caused_pairs(s: Signals, along: np.ndarray | None, order: int) -> Iterator[SignalPair]:
     """Motors with the force that they make and the thrust that was asked for. What the
     accelerometer or else the path feels is moved by floor, wakes and gusts, too: it
     must follow where the motors do much.
@@ -254,7 +256,7 @@ def _caused_pairs(s: Signals, along: np.ndarray | None, order: int) -> Iterator[
     if s.motor is None:
         return
     if s.rotors is not None:
-        yield Pair(
+        yield SignalPair(
             names=CHANNEL_COLUMNS["rotor_speed"],
             signal=100 * s.rotors / np.median(s.rotors),
             what="m1, m2, m3, m4",
@@ -268,7 +270,7 @@ def _caused_pairs(s: Signals, along: np.ndarray | None, order: int) -> Iterator[
     force, order = (along, order) if s.force is None else (s.force[:, 2:], 0)
     if force is not None:
         usual = max(float(np.median(collective)), 1e-3)
-        pair = Pair(
+        pair = SignalPair(
             names=("the force felt",),
             signal=force,
             what="what the motors would make",
@@ -280,7 +282,7 @@ def _caused_pairs(s: Signals, along: np.ndarray | None, order: int) -> Iterator[
         )
         yield pair if not pair.bad.any() else _without_air(s, pair)
     if s.thrust is not None and not s.has_saturation:
-        yield Pair(
+        yield SignalPair(
             names=("cmd_thrust",),
             signal=100 * s.thrust,
             what="m1 + m2 + m3 + m4",
@@ -292,7 +294,7 @@ def _caused_pairs(s: Signals, along: np.ndarray | None, order: int) -> Iterator[
         )
 
 
-def _without_air(s: Signals, pair: Pair) -> Pair:
+def _without_air(s: Signals, pair: SignalPair) -> SignalPair:
     """A pair of a force along the body's z axis without what goes with the air, where
     attitude and velocity say how that goes: drag by the vehicle's own motion, and by a
     steady wind that a leaning body meets along z. Motors answer both, so both sides lose it,

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from openjax.flying.controller import Pose, level_acceleration, moved_on
 from openjax.flying.drift import drifting
 from openjax.flying.innovations import Innovations
-from openjax.flying.judge import Track, Verdict, agree, follows
+from openjax.flying.judge import PoseHistory, Verdict, agree, follows
 from openjax.flying.set_point import as_sent
 from openjax.flying.state import FLYING, SPIN_UP, Drone, Mode, PoseSample, State
 
@@ -127,7 +127,7 @@ def _consistent(state, drone, own_track, force) -> Drone:
     return drone._replace(estimate=estimate, capture_fault=verdict)
 
 
-def _onboard_track(state, drone, sample, by_capture, moving) -> Track:
+def _onboard_track(state, drone, sample, by_capture, moving) -> PoseHistory:
     """The drone's own estimates after the newest one, which motion capture must confirm
     where they were lost or wrong.
     """

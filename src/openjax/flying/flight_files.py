@@ -124,7 +124,7 @@ class CaseFolder:
 
 
 @dataclass(frozen=True)
-class Samples:
+class VehicleSamples:
     """The recorded samples of one vehicle; times are host seconds. NumPy."""
 
     poses: np.ndarray
@@ -151,7 +151,11 @@ class GameLog:
         self._until = -np.inf
 
     def piece(
-        self, samples: Sequence[Samples], sent_at: np.ndarray, commands: np.ndarray, until: float
+        self,
+        samples: Sequence[VehicleSamples],
+        sent_at: np.ndarray,
+        commands: np.ndarray,
+        until: float,
     ) -> bytes:
         """The rows after the last piece and up to `until` (s), packed; empty where
         there are none.
@@ -198,7 +202,7 @@ class _Source(NamedTuple):
         return _Source(time[inside], self.names, self.values[inside])
 
 
-def _sources(vehicle: Samples) -> list[_Source]:
+def _sources(vehicle: VehicleSamples) -> list[_Source]:
     """All that was recorded of a vehicle; what comes later replaces what came
     before.
     """
@@ -214,7 +218,7 @@ def _sources(vehicle: Samples) -> list[_Source]:
     return [poses, bodies, capture]
 
 
-def _rows(vehicle: Samples, sent_at, commands, window) -> dict[str, np.ndarray]:
+def _rows(vehicle: VehicleSamples, sent_at, commands, window) -> dict[str, np.ndarray]:
     """The rows of one vehicle in a window of time, by column: one for each moment at
     which something was measured.
     """

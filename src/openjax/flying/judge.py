@@ -129,7 +129,7 @@ def judge(
     return Verdict.GOOD
 
 
-class Track(NamedTuple):
+class PoseHistory(NamedTuple):
     """The history of one source of a vehicle's poses."""
 
     pose: Pose | None = None  # the last good one
@@ -147,7 +147,7 @@ class Track(NamedTuple):
         limits: PoseLimits,
         moving: bool,
         prediction: Pose | None,
-    ) -> "Track":
+    ) -> "PoseHistory":
         """The track after its source's newest pose at `time` (s).
 
         A pose that isn't newer than the last good one, or old, or from the future,
@@ -166,7 +166,7 @@ class Track(NamedTuple):
             verdict = judge(
                 pose, last, pose.time - max(self.last_time, last.time), limits, prediction
             )
-        return Track(last if verdict else pose, verdict, pose.time)
+        return PoseHistory(last if verdict else pose, verdict, pose.time)
 
 
 def at_one_time(a: Pose, b: Pose) -> tuple[Pose, Pose]:

@@ -20,8 +20,8 @@ from openjax.flying import real_time
 from openjax.flying.board import Board, Role, say, stand_alone
 from openjax.flying.controller import numbers_of
 from openjax.flying.guard import CHECK
-from openjax.flying.member import Member
-from openjax.flying.record_pipe import Kind, Teller
+from openjax.flying.member import SwarmMember
+from openjax.flying.record_pipe import RecordKind, Teller
 from openjax.flying.set_point import SetPoint
 from openjax.flying.state import State
 from openjax.flying.swarm import Swarm
@@ -106,7 +106,7 @@ def _say_nothing(_) -> None:
     """In place of the traceback of a thread."""
 
 
-def _tell(teller: Teller, vehicle: int, kind: Kind, row) -> None:
+def _tell(teller: Teller, vehicle: int, kind: RecordKind, row) -> None:
     """Tell the recorder what was sampled on board of a vehicle."""
     teller.row(kind, vehicle, row)
 
@@ -119,7 +119,7 @@ def _pass_on(swarm: Swarm, contacts, stream: socket.socket) -> None:
     # who hears the vehicles must never wait for a loop that doesn't read
     stream.setblocking(False)
 
-    def pass_on(vehicle: int, member: Member, new_pose: bool) -> None:
+    def pass_on(vehicle: int, member: SwarmMember, new_pose: bool) -> None:
         contacts[vehicle] = member.last_contact
         if new_pose:
             force = member.sample().force or _NO_FORCE

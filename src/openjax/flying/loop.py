@@ -45,7 +45,7 @@ def flight_state(game: Game, number: int, safety: SafetySettings) -> State:
 
 
 @dataclass(frozen=True)
-class Plan:
+class FlightPlan:
     """The plan of a flight."""
 
     episodes: int = 1
@@ -54,7 +54,7 @@ class Plan:
     """End each game after this time, if it isn't over before (s)."""
 
 
-class Flight:
+class FlightLoop:
     """One flight: take-off, games, landing.
 
     Args:
@@ -74,7 +74,7 @@ class Flight:
         vehicles: Links,
         game: Game,
         state: State,
-        plan: Plan,
+        plan: FlightPlan,
         requests: Callable[[], Request] = lambda: Request.NONE,
         watch: Callable[[float, State], str] = lambda now, state: "",
         record: FlightRecord | None = None,

@@ -7,7 +7,7 @@ from time import perf_counter
 from openjax.flying.controller import Pose, numbers_of
 from openjax.flying.crtp import expand_quaternion
 from openjax.flying.onboard_clock import OnboardClock
-from openjax.flying.record_pipe import Kind
+from openjax.flying.record_pipe import RecordKind
 from openjax.flying.state import FORCE_AGE, PoseSample
 
 PERIOD_MS = 10
@@ -27,7 +27,7 @@ BODY_BLOCK = (
 )
 
 
-class Member:
+class SwarmMember:
     """One vehicle of the swarm."""
 
     def __init__(self, uri: str):
@@ -41,8 +41,8 @@ class Member:
         # host s, the newest specific force (m/s^2, body)
         self.felt: tuple = (-math.inf, None)
         self.error: str | None = None
-        # rows as in `openjax.flying.flight_files.Samples`
-        self.tell: Callable[[Kind, tuple[float, ...]], None] = lambda kind, row: None
+        # rows as in `openjax.flying.flight_files.VehicleSamples`
+        self.tell: Callable[[RecordKind, tuple[float, ...]], None] = lambda kind, row: None
         self.listener: Callable[[bool], None] = lambda new_pose: None
         self.crazyflie = None
         self.blocks: list = []
@@ -78,7 +78,7 @@ class Member:
         self.pose = pose
         self.arrival = arrival
         self.last_contact = arrival
-        self.tell(Kind.POSES, (arrival, self.voltage, *numbers_of(pose)))
+        self.tell(RecordKind.POSES, (arrival, self.voltage, *numbers_of(pose)))
         self.listener(True)
 
     def body_arrived(self, stamp: int, data: dict, _block=None) -> None:
@@ -93,5 +93,5 @@ class Member:
         if time > self.felt[0]:  # packets may overtake each other
             self.felt = time, force
         motors = tuple(data[name] / 65536 for name, _ in BODY_BLOCK[:4])
-        self.tell(Kind.BODIES, (time, *motors, *force, *rates))
+        self.tell(RecordKind.BODIES, (time, *motors, *force, *rates))
         self.listener(False)

@@ -24,7 +24,7 @@ from pathlib import Path
 from openjax.errors import UserError
 from openjax.flying.controller import Pose, numbers_of
 from openjax.flying.links import Links
-from openjax.flying.record_pipe import Kind, Teller
+from openjax.flying.record_pipe import RecordKind, Teller
 from openjax.flying.state import PoseSample
 
 
@@ -81,7 +81,7 @@ class MotionCaptured(Links):
         """This pose of motion capture was judged good: it is told to the recorder, and
         sent to the vehicle if it `feeds_estimator`.
         """
-        self._teller.row(Kind.CAPTURE, vehicle, numbers_of(pose))
+        self._teller.row(RecordKind.CAPTURE, vehicle, numbers_of(pose))
         if feeds_estimator:
             self.send_pose(vehicle, pose)
 

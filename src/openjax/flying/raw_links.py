@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from openjax.flying.crazyflie_links import never_wait, send_set_point
 from openjax.flying.crtp import LOG_TYPES, Port, SupervisorCommand
-from openjax.flying.member import POSE_BLOCK, Member
+from openjax.flying.member import POSE_BLOCK, SwarmMember
 from openjax.flying.set_point import SetPoint
 from openjax.flying.state import PoseSample
 from openjax.flying.swarm import WATCHDOG_PERIOD
@@ -27,7 +27,7 @@ class RawLinks:
     """
 
     def __init__(self, uris: Sequence[str], pose_blocks: Sequence[int], watchdog: bool = True):
-        self._members: list[Member] = []
+        self._members: list[SwarmMember] = []
         self._blocks = tuple(pose_blocks)
         self._links = dict.fromkeys(uris)
         self._watchdog = watchdog
@@ -42,7 +42,7 @@ class RawLinks:
         # once a process: the library keeps what it found
         if not cflib.crtp.CLASSES:
             cflib.crtp.init_drivers()
-        self._members = self._members or [Member(uri) for uri in self._links]
+        self._members = self._members or [SwarmMember(uri) for uri in self._links]
         for uri, link in self._links.items():
             # a dongle belongs to one process: as long as the links' process has it, it
             # can't be opened

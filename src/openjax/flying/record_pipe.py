@@ -18,7 +18,7 @@ _ATOM = 4096
 """A pipe takes so many bytes whole or not at all."""
 
 
-class Kind(IntEnum):
+class RecordKind(IntEnum):
     """The kind of a record; its number is a vehicle's or a game's."""
 
     POSES = 0
@@ -30,9 +30,9 @@ class Kind(IntEnum):
     END = 6
 
 
-WIDTHS = {Kind.POSES: 16, Kind.BODIES: 11, Kind.CAPTURE: 14}
+WIDTHS = {RecordKind.POSES: 16, RecordKind.BODIES: 11, RecordKind.CAPTURE: 14}
 """Numbers in a row of `Samples`."""
-MEASURED = {Kind.POSES: 2, Kind.BODIES: 0, Kind.CAPTURE: 0}
+MEASURED = {RecordKind.POSES: 2, RecordKind.BODIES: 0, RecordKind.CAPTURE: 0}
 """Which of them is the time of the measurement."""
 
 
@@ -52,12 +52,12 @@ class Teller:
         if pipe is not None:
             os.set_blocking(pipe.fileno(), False)
 
-    def row(self, kind: Kind, number: int, numbers) -> None:
+    def row(self, kind: RecordKind, number: int, numbers) -> None:
         """Tell a row of numbers."""
         if self._pipe is not None:
             self.tell(kind, number, struct.pack(f"<{len(numbers)}d", *numbers))
 
-    def tell(self, kind: Kind, number: int, data: bytes) -> None:
+    def tell(self, kind: RecordKind, number: int, data: bytes) -> None:
         """Tell a record."""
         if self._pipe is None:
             return
@@ -79,4 +79,4 @@ class Teller:
         """Return once the pipe has taken everything, or at `deadline` (s)."""
         while self._backlog and time.monotonic() < deadline:
             time.sleep(REST)
-            self.tell(Kind.END, 0, b"")
+            self.tell(RecordKind.END, 0, b"")

@@ -21,9 +21,9 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.flying.board import say, stand_alone, start_deaf
-from openjax.flying.flight_files import CaseFolder, GameLog, Samples
+from openjax.flying.flight_files import CaseFolder, GameLog, VehicleSamples
 from openjax.flying.flight_record import FlightRecord
-from openjax.flying.record_pipe import HEAD, MEASURED, REST, WIDTHS, Kind, Teller
+from openjax.flying.record_pipe import HEAD, MEASURED, REST, WIDTHS, RecordKind, Teller
 
 EVERY = 1.0
 """s between two pieces of a log."""
@@ -48,7 +48,7 @@ class NewCase(NamedTuple):
     """Content of flight.json beside timing and games."""
 
 
-class Outcome(NamedTuple):
+class LogOutcome(NamedTuple):
     """The fate of a log."""
 
     folder: Path | None = None
@@ -103,22 +103,22 @@ class Recorder:
 
     def begin(self, scheduler: str) -> None:
         """A flight begins: from now on there is a folder."""
-        self.teller.tell(Kind.BEGIN, 0, json.dumps({"scheduler": scheduler}).encode())
+        self.teller.tell(RecordKind.BEGIN, 0, json.dumps({"scheduler": scheduler}).encode())
 
     def tell_tick(self, row: bytes) -> None:
         """See `FlightRecord`."""
-        self.teller.tell(Kind.TICK, 0, row)
+        self.teller.tell(RecordKind.TICK, 0, row)
 
     def tell_game(self, number: int, notes: dict) -> None:
         """See `FlightRecord`."""
-        self.teller.tell(Kind.GAME, number, json.dumps(notes).encode())
+        self.teller.tell(RecordKind.GAME, number, json.dumps(notes).encode())
 
-    def end(self, reasons: list[str]) -> Outcome:
+    def end(self, reasons: list[str]) -> LogOutcome:
         """The flight is over, for these reasons; what became of the log."""
         if self._process is None:
-            return Outcome()
+            return LogOutcome()
         deadline = time.monotonic() + CLOSING
-        self.teller.tell(Kind.END, 0, json.dumps({"reasons": reasons}).encode())
+        self.teller.tell(RecordKind.END, 0, json.dumps({"reasons": reasons}).encode())
         self.teller.tell_all(deadline)
         try:
             if self._answer.poll(max(deadline - time.monotonic(), 0.0)):
@@ -128,7 +128,7 @@ class Recorder:
             state = "is gone"
         folder = self._case.folder
         complaint = f"the recorder's process {state}: {folder} holds what it had written by then"
-        return Outcome(None, 0.0, complaint)
+        return LogOutcome(None, 0.0, complaint)
 
     def close(self) -> None:
         """End the process; it has written everything, or nothing flew."""
@@ -202,26 +202,26 @@ class _Book:
             if len(data) - at < HEAD.size + size:
                 break
             at += HEAD.size
-            self._take_one(Kind(kind), number, data[at : at + size])
+            self._take_one(RecordKind(kind), number, data[at : at + size])
             at += size
         return data[at:]
 
-    def _take_one(self, kind: Kind, number: int, data: bytes) -> None:
+    def _take_one(self, kind: RecordKind, number: int, data: bytes) -> None:
         if kind in WIDTHS:
             rows = self._rows[kind, number]
             rows.frombytes(data)
-            if kind is not Kind.CAPTURE:
+            if kind is not RecordKind.CAPTURE:
                 self._newest["links"] = rows[MEASURED[kind] - WIDTHS[kind]]
-        elif kind is Kind.TICK:
+        elif kind is RecordKind.TICK:
             self._record.add(data)
             self._newest["loop"] = array("d", data)[1]
-        elif kind is Kind.GAME:
+        elif kind is RecordKind.GAME:
             self._notes[number] = json.loads(data)
             self._logs.setdefault(number, GameLog(number))
         elif data:
             self._about |= json.loads(data)
-            self.is_over = kind is Kind.END
-        if kind is Kind.BEGIN:
+            self.is_over = kind is RecordKind.END
+        if kind is RecordKind.BEGIN:
             self._case_folder = CaseFolder(self._case.folder)
             for name, content in self._case.files.items():
                 self._case_folder.put(name, content)
@@ -245,12 +245,12 @@ class _Book:
         # a row's time is rounded when it is written
         self._forget(until - REST)
 
-    def _samples(self, i: int) -> Samples:
+    def _samples(self, i: int) -> VehicleSamples:
         """What was told of vehicle i and isn't forgotten."""
         poses, bodies, captures = (
             np.array(self._rows[kind, i]).reshape(-1, width) for kind, width in WIDTHS.items()
         )
-        return Samples(poses, bodies, captures)
+        return VehicleSamples(poses, bodies, captures)
 
     def _forget(self, moment: float) -> None:
         """Forget the rows that were measured before a moment (s)."""
@@ -264,10 +264,10 @@ class _Book:
         text = json.dumps({**self._about, **more, "games": games}, indent=1)
         self._case_folder.put("flight.json", (text + "\n").encode())
 
-    def close(self) -> Outcome:
+    def close(self) -> LogOutcome:
         """Write the rest; what became of the log."""
         if self._case_folder is None:
-            return Outcome()
+            return LogOutcome()
         self.write(np.inf)
         if not self.is_over:
             self._about["reasons"] = [CUT] * self._vehicles
@@ -279,7 +279,7 @@ class _Book:
         elif folder.refusal:
             complaint = f"{folder.refusal}: no log, or a part of it"
         is_there = folder.folder.is_dir()
-        return Outcome(folder.folder if is_there else None, self._longest(), complaint)
+        return LogOutcome(folder.folder if is_there else None, self._longest(), complaint)
 
     def _longest(self) -> float:
         """s of the longest game."""

@@ -17,11 +17,11 @@ from openjax.flying.flight_record import FlightRecord
 from openjax.flying.guard import Guard
 from openjax.flying.keys import Operator
 from openjax.flying.links import Links
-from openjax.flying.loop import Flight
+from openjax.flying.loop import FlightLoop
 from openjax.flying.motion_capture import MotionCaptured
 from openjax.flying.preflight import faults, poses_arriving
 from openjax.flying.raw_links import RawLinks
-from openjax.flying.recorder import NewCase, Outcome, Recorder
+from openjax.flying.recorder import LogOutcome, NewCase, Recorder
 from openjax.flying.state import Request, State
 from openjax.flying.takeover import fly_down
 from openjax.flying.ticks import measured_times
@@ -131,7 +131,7 @@ class Session:
                 say(line)
             raise UserError(f"no take-off for these {len(problems)} reasons")
 
-    def fly(self, flight: Flight) -> Outcome:
+    def fly(self, flight: FlightLoop) -> LogOutcome:
         """Arm and fly; what became of the log, with a complaint where another process
         landed.
         """

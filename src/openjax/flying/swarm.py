@@ -13,7 +13,7 @@ from time import perf_counter, sleep
 
 from openjax.errors import UserError
 from openjax.flying.crazyflie_links import never_wait, restart, send_set_point
-from openjax.flying.member import BODY_BLOCK, PERIOD_MS, POSE_BLOCK, Member
+from openjax.flying.member import BODY_BLOCK, PERIOD_MS, POSE_BLOCK, SwarmMember
 from openjax.flying.set_point import SetPoint
 from openjax.flying.state import PoseSample
 
@@ -46,7 +46,7 @@ class Swarm:
         self._body_logs = body_logs
         self._watchdog = watchdog
         self._fed = -math.inf
-        self.members = [Member(uri) for uri in uris]
+        self.members = [SwarmMember(uri) for uri in uris]
 
     def connect(self, timeout: float = 20.0) -> None:
         """Open all links and start the log blocks.

@@ -56,7 +56,7 @@ class Players:
 
 
 @struct.dataclass
-class Noise:
+class ExplorationNoise:
     """The exploration noise of a rollout, standard normal, drawn ahead in one go."""
 
     pursuers: jax.Array  # (T, E, N, A)
@@ -66,7 +66,7 @@ class Noise:
 def collect(
     players: Players,
     world: tuple[Observation, PursuitState],
-    noise: Noise,
+    noise: ExplorationNoise,
     penalty_share: Scalar | float = 1.0,
 ) -> tuple[Rollout, Observation, PursuitState]:
     """Act with exploration for T steps in E worlds.

@@ -19,10 +19,10 @@ from openjax.learning.archive import TaskArchive, empty_archive
 from openjax.learning.collectives import gather_over_devices, mean_over_devices, own_keys
 from openjax.learning.generator import generate_task, select, successes, task_like
 from openjax.learning.learners.evasion import EvaderLearner
-from openjax.learning.learners.learner import Flown, Learner, check_learners, check_learning
+from openjax.learning.learners.learner import Experience, Learner, check_learners, check_learning
 from openjax.learning.learners.mappo import Mappo
 from openjax.learning.learners.predictor_update import PredictorLearner
-from openjax.learning.rollout import Noise, Players, collect
+from openjax.learning.rollout import ExplorationNoise, Players, collect
 from openjax.learning.settings import TrainSettings
 from openjax.policy import Network, OwnPolicy, Policy, PolicyParameters, check_network, make_policy
 from openjax.pursuit import Observation, Pursuit, PursuitState
@@ -171,9 +171,9 @@ class Phases:
     with it.
     """
 
-    fly: Callable[[TrainCarry], tuple[TrainCarry, Flown, dict[str, jax.Array]]]
+    fly: Callable[[TrainCarry], tuple[TrainCarry, Experience, dict[str, jax.Array]]]
     """carry -> carry after a rollout, what is learnt from it, metrics"""
-    learn: tuple[Callable[[TrainCarry, Flown], tuple[TrainCarry, dict[str, jax.Array]]], ...]
+    learn: tuple[Callable[[TrainCarry, Experience], tuple[TrainCarry, dict[str, jax.Array]]], ...]
     """(carry, flown) -> carry after an update, metrics; one for each learner"""
     renew: Callable[[TrainCarry], tuple[TrainCarry, dict[str, jax.Array]]]
     """carry -> carry whose worlds have new tasks where their episodes have just ended,
@@ -249,7 +249,7 @@ class _Step:
         keys = own_keys(self._key(carry, "noise"), carry.state.step.shape[0], axis)
         # a key for each world: the same noise on however many devices the worlds lie
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(keys)
-        noise = Noise(jnp.moveaxis(noise, 1, 0))
+        noise = ExplorationNoise(jnp.moveaxis(noise, 1, 0))
         act = self._evaders(carry)
         hold = settings.evader_learning.HOLD
         if act is not None:
@@ -263,7 +263,7 @@ class _Step:
         rollout, observation, state = collect(players, world, noise, share)
         # a rollout keeps the newest frame of each step only: windows begin in the
         # history before it
-        experience = Flown(
+        experience = Experience(
             rollout=rollout,
             frames=carry.state.frames,
             observation=observation,

@@ -18,7 +18,7 @@ from openjax.cluster.devices import (
     everywhere,
     make_device_step,
 )
-from openjax.evaluation.validation import Validation
+from openjax.evaluation.validation import ValidationTasks
 from openjax.learning import TrainCarry, make_start
 from openjax.learning.training_step import Phases
 from openjax.runs.gradient_stages import (
@@ -79,7 +79,7 @@ class Programs:
     first_flights: FirstFlightsProgram | None
     """None where they aren't part of the run, or are over."""
     validation: Pending | None
-    """Gives a `Validation`; None in all processes but the first."""
+    """Gives a `ValidationTasks`; None in all processes but the first."""
     last_stage: Pending | None
     """Gives the stage, see `compile_last_stage`; None where `validation` is."""
 
@@ -125,7 +125,7 @@ def _make_validation(job, policy):
     """
     load_orbax()
     settings = job.settings
-    validation = Validation(
+    validation = ValidationTasks(
         job.parts.environment,
         job.parts.policy,
         settings.validation_episodes,

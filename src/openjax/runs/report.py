@@ -9,7 +9,7 @@ import jax
 from rich.table import Table
 
 from openjax.evaluation.evaluator import layout_tasks
-from openjax.evaluation.validation import Validation
+from openjax.evaluation.validation import ValidationTasks
 from openjax.files import write_json
 from openjax.runs.job import TrainingJob
 from openjax.runs.loop import Outcome
@@ -26,7 +26,7 @@ _BESIDE_RECORD = ("episode_return", "last_seen_error")
 def report(
     job: TrainingJob,
     directory: RunDirectory,
-    validation: Validation,
+    validation: ValidationTasks,
     outcome: Outcome,
     progress: Progress,
 ) -> Table:

@@ -155,7 +155,7 @@ def learn(run: Run, state: RunState) -> Outcome:
             progress=run.progress,
             directory=run.directory.path,
             stop=run.stop,
-            evaluate=Evaluation(run),
+            evaluate=CheckpointScore(run),
             first_update=state.update,
             seconds=state.seconds + time.monotonic() - run.job.began,
             everyone=run.job.processes.everyone,
@@ -186,7 +186,7 @@ def _metrics(run, state):
 
 
 @dataclasses.dataclass(frozen=True)
-class Evaluation:
+class CheckpointScore:
     """Score and metrics of a carry on the validation tasks; the same in all processes."""
 
     run: Run

@@ -44,7 +44,7 @@ SCHEMAS = {
 
 
 @dataclass(frozen=True)
-class Channel:
+class Topic:
     """A topic: its name, its schema, and (time in s, message without time stamp)."""
 
     topic: str
@@ -52,7 +52,7 @@ class Channel:
     messages: Sequence[tuple[float, dict]]
 
 
-def write_mcap(path: Path, channels: Iterable[Channel]) -> None:
+def write_mcap(path: Path, channels: Iterable[Topic]) -> None:
     """Write channels, or nothing. Raises UserError without the library."""
     try:
         from mcap.writer import Writer
@@ -91,7 +91,7 @@ def pose(position, quaternion=(1.0, 0.0, 0.0, 0.0)) -> dict:
     }
 
 
-def pose_channel(topic: str, time, position, quaternion=None) -> Channel:
+def pose_channel(topic: str, time, position, quaternion=None) -> Topic:
     """The poses of one vehicle: times (T,) s, positions (T, 3) m, attitudes (T, 4) wxyz
     or None; rows that weren't sampled are left out.
     """
@@ -101,10 +101,10 @@ def pose_channel(topic: str, time, position, quaternion=None) -> Channel:
     messages = [
         (float(time[k]), {"frame_id": WORLD, "pose": pose(position[k], attitude[k])}) for k in rows
     ]
-    return Channel(topic, "foxglove.PoseInFrame", messages)
+    return Topic(topic, "foxglove.PoseInFrame", messages)
 
 
-def trajectory_channels(name: str, flight: Trajectory) -> list[Channel]:
+def trajectory_channels(name: str, flight: Trajectory) -> list[Topic]:
     """An episode: a pose for each drone, and a scene with drones and pillars. `name`
     begins the topics.
     """
@@ -131,7 +131,7 @@ def trajectory_channels(name: str, flight: Trajectory) -> list[Channel]:
     if len(scenes):
         # in the first scene only: what stands stays
         scenes[0][1]["entities"] += _pillars(flight)
-    return [*poses, Channel(f"/{name}/scene", "foxglove.SceneUpdate", scenes)]
+    return [*poses, Topic(f"/{name}/scene", "foxglove.SceneUpdate", scenes)]
 
 
 def _entity(name: str, kind: str, position, size, colour: dict) -> dict:

@@ -13,7 +13,7 @@ from openjax.vehicle.mjx_body import make_world, mjx_step
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.rigid_body import rigid_step
 from openjax.vehicle.shapes import Active, Pillars, Team, Vector
-from openjax.vehicle.solids import Surroundings, encounters, place_solids, surroundings
+from openjax.vehicle.solids import Obstacles, encounters, place_solids, surroundings
 from openjax.vehicle.state import DroneState
 
 
@@ -34,7 +34,7 @@ class Bodies:
         drones: DroneState,
         force: Team,
         torque: Team,
-        around: Surroundings | None,
+        around: Obstacles | None,
     ) -> DroneState:
         """The drones (leading axis N) after `dt`; the leaves of `vehicle` are those of
         all drones or, with that axis, of each.
@@ -56,7 +56,7 @@ class Bodies:
 
     def around(
         self, drones: DroneState, pillar_position: Pillars, pillar_active: Active
-    ) -> Surroundings | None:
+    ) -> Obstacles | None:
         """The things that each drone (leading axis N) may touch in this step; None if nothing is
         solid.
 
@@ -72,7 +72,7 @@ class Bodies:
         drone: DroneState,
         force: Vector,
         torque: Vector,
-        around: Surroundings | None,
+        around: Obstacles | None,
     ) -> DroneState:
         """One drone by the written-out equations, in free flight if nothing is
         `around`.

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from openjax.vehicle.arena import Arena
 from openjax.vehicle.shapes import Components, Seconds, Vector
-from openjax.vehicle.solids import Surroundings, Thing, approach, encounters, shown_gap
+from openjax.vehicle.solids import Obstacles, Thing, approach, encounters, shown_gap
 
 
 def contact_acceleration(
@@ -20,7 +20,7 @@ def contact_acceleration(
     position: Vector,
     velocity: Vector,
     acceleration: Vector,
-    around: Surroundings,
+    around: Obstacles,
     dt: Seconds,
 ) -> Vector:
     """The acceleration that contacts add over a step of dt seconds to the `acceleration` (3,) m/s^2

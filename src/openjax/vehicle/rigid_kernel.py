@@ -22,7 +22,7 @@ from openjax.vehicle.arena import Arena
 from openjax.vehicle.contacts import contact_acceleration, looped_contact_acceleration
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.rigid_body import euler_step
-from openjax.vehicle.solids import Surroundings, floor, other_drone, pillar, surroundings
+from openjax.vehicle.solids import Obstacles, floor, other_drone, pillar, surroundings
 from openjax.vehicle.state import DroneState
 
 WORTH = 16384
@@ -48,7 +48,7 @@ class FusedStep(NamedTuple):
     substeps: int
 
     def one(
-        self, vehicle: Vehicle, drone: DroneState, command, around: Surroundings | None
+        self, vehicle: Vehicle, drone: DroneState, command, around: Obstacles | None
     ) -> DroneState:
         """One drone after a substep, in free flight if nothing is `around`."""
         next_drone, acceleration, angular = self.accelerate(vehicle, drone, command)

@@ -39,7 +39,7 @@ PARKED = -100.0  # m, height of a pillar that isn't there
 
 
 @flax.struct.dataclass
-class Surroundings:
+class Obstacles:
     """The things that one drone may touch beside the floor: P pillar slots and K other drones."""
 
     pillar_position: Pillars
@@ -134,7 +134,7 @@ def others(n: int) -> np.ndarray:
 
 def surroundings(
     position: Team, velocity: Team, pillar_position: Pillars, pillar_active: Active
-) -> Surroundings:
+) -> Obstacles:
     """The things that each of N drones may touch, leading axis N.
 
     position and velocity (N, 3) of the drones, pillar_position (P, 2) m, pillar_active
@@ -146,7 +146,7 @@ def surroundings(
         return jnp.broadcast_to(array, (n, *array.shape))
 
     neighbours = others(n)
-    return Surroundings(
+    return Obstacles(
         pillar_position=each(pillar_position.astype(position.dtype)),
         pillar_active=each(pillar_active),
         other_position=position[neighbours],
@@ -198,7 +198,7 @@ def _things(arena, position, around) -> Thing:
 
 
 def encounters(
-    arena: Arena, position: Vector, velocity: Vector, around: Surroundings, dt: Seconds
+    arena: Arena, position: Vector, velocity: Vector, around: Obstacles, dt: Seconds
 ) -> Encounters:
     """One drone at `position` (3,) m with `velocity` (3,) m/s beside its solid things,
     for a step of dt seconds.

@@ -38,7 +38,7 @@ SPENT = 0.9
 """By how much it falls from full to empty (V): empty is about 3.25 V."""
 
 
-class Report(NamedTuple):
+class SensorReadings(NamedTuple):
     """Arrays (N, ...) of what the firmware senses."""
 
     position: np.ndarray
@@ -110,12 +110,12 @@ class VirtualVehicles:
         self.battery = np.full(self.number, self._charge)
         self.report = self.advance(np.zeros((self.number, 5), np.float32), 0)
 
-    def advance(self, set_points: np.ndarray, steps: int) -> Report:
+    def advance(self, set_points: np.ndarray, steps: int) -> SensorReadings:
         """What is sensed after `steps` steps under constant set-points (N, 5) float32,
         see `SetPoint`; after none, what the motors are asked for by new ones.
         """
         self._state, report = self._advance(self._state, set_points, np.int32(steps))
-        self.report = Report._make(np.asarray(leaf, np.float64) for leaf in report)
+        self.report = SensorReadings._make(np.asarray(leaf, np.float64) for leaf in report)
         share = self.report.motor_command.mean(1) / self._hover
         self.battery = np.maximum(self.battery - steps * STEP * share / self._endurance, 0.0)
         # once for all packets of a moment
@@ -151,7 +151,7 @@ class VirtualVehicles:
         # the next one
         command = commands(drones.quaternion, set_points)
         motor, _ = jax.vmap(lambda d, c: rate_controller(plant, d, c, STEP))(drones, command)
-        report = Report(
+        report = SensorReadings(
             position=drones.position,
             velocity=drones.velocity,
             quaternion=drones.quaternion,

@@ -82,11 +82,11 @@ class VirtualProcess:
 
 
 def _serve(scenario, truth, pipe) -> None:
-    from openjax.commands.virtual_crazyflie import Arguments, make
+    from openjax.commands.virtual_crazyflie import VirtualCrazyflieCommand, make
     from openjax.flying import real_time
 
     real_time.prepare()
-    virtual = make(Arguments(scenario=scenario, port=0))
+    virtual = make(VirtualCrazyflieCommand(scenario=scenario, port=0))
     flown = _Flown(virtual, truth, pipe)
     real_time.hurry()
     pipe.send(virtual.uris)

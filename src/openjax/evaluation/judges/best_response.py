@@ -27,7 +27,7 @@ from openjax.evaluation.judges.senses import sense, to_world
 from openjax.evaluation.judges.settings import BestResponseSettings
 from openjax.learning.advantages import generalised_advantages
 from openjax.learning.learners.ppo import (
-    Answer,
+    NetworkOutputs,
     Objective,
     Samples,
     for_many,
@@ -293,7 +293,7 @@ class BestResponse:
         senses, way, sample = part.inputs
         means, odds = ways(apply_network(actor, senses))
         spread_out = jnp.sum(log_std, -1) - jnp.mean(jnp.sum(jnp.exp(odds) * odds, -1), axis=1)
-        answer = Answer(
+        answer = NetworkOutputs(
             log_prob=_log_prob(way, sample, means, odds, log_std[:, None]),
             value=apply_network(critic, senses)[..., 0],
             bonus=settings.entropy_coefficient * spread_out,

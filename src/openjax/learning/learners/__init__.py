@@ -10,7 +10,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "evasion": "EvaderLearner",
-        "learner": "Flown Learner",
+        "learner": "Experience Learner",
         "mappo": "Mappo",
         "predictor_update": "PredictorLearner",
     },

@@ -20,9 +20,9 @@ from jaxtyping import Array, Float, Int32, PRNGKeyArray
 
 from openjax.learning.advantages import generalised_advantages
 from openjax.learning.collectives import mean_over_devices, minibatches
-from openjax.learning.learners.learner import Flown
+from openjax.learning.learners.learner import Experience
 from openjax.learning.learners.ppo import (
-    Answer,
+    NetworkOutputs,
     Objective,
     Samples,
     for_many,
@@ -169,7 +169,7 @@ class EvaderLearner:
         self,
         state: LearningEvaders,
         parameters: PolicyParameters,
-        experience: Flown,
+        experience: Experience,
         key: PRNGKeyArray,
     ) -> tuple[LearningEvaders, PolicyParameters, dict[str, Scalar]]:
         """After all epochs on the samples of a rollout."""
@@ -281,7 +281,7 @@ class EvaderLearner:
         # weighted too: before the first of its worlds begins, a network's noise stays
         # as it is
         bonus = mean(self.settings.ENTROPY_COEFFICIENT * gaussian_entropy(log_std))
-        answer = Answer(log_prob, outputs(critic, features)[1], bonus)
+        answer = NetworkOutputs(log_prob, outputs(critic, features)[1], bonus)
         objective = Objective(mean, self.settings.CLIP_EPSILON, optax.l2_loss)
         return objective.loss(answer, part)[0]
 

@@ -17,7 +17,7 @@ from openjax.pursuit.shapes import Scalar
 
 
 @struct.dataclass
-class Flown:
+class Experience:
     """A rollout of T steps in E worlds, and what lies before and after it."""
 
     rollout: Rollout  # (T, E, ...)
@@ -54,7 +54,7 @@ class Learner(Protocol):
         """Its state before the first update of a policy with fresh `parameters`."""
 
     def learn(
-        self, state: Any, parameters: PolicyParameters, experience: Flown, key: PRNGKeyArray
+        self, state: Any, parameters: PolicyParameters, experience: Experience, key: PRNGKeyArray
     ) -> tuple[Any, PolicyParameters, dict[str, Scalar]]:
         """After a rollout: its state, the policy's parameters, and () metrics by name.
 

@@ -13,9 +13,9 @@ from jaxtyping import PRNGKeyArray
 
 from openjax.learning.advantages import generalised_advantages
 from openjax.learning.collectives import joint_moments, minibatches
-from openjax.learning.learners.learner import Flown
+from openjax.learning.learners.learner import Experience
 from openjax.learning.learners.ppo import (
-    Answer,
+    NetworkOutputs,
     Objective,
     Samples,
     gradient_steps,
@@ -135,7 +135,7 @@ def loss(
     mean, log_std, value = policy.evaluate(actor, critic, observation, predicted)
     log_prob = gaussian_log_prob(action, mean, log_std)
     entropy = gaussian_entropy(log_std)
-    answer = Answer(log_prob, value, settings.entropy_coefficient * entropy)
+    answer = NetworkOutputs(log_prob, value, settings.entropy_coefficient * entropy)
     objective = Objective(
         mean=functools.partial(team_mean, observation.active),
         clip=clip,
@@ -190,7 +190,11 @@ class Mappo:
         )
 
     def learn(
-        self, state: MappoState, parameters: PolicyParameters, experience: Flown, key: PRNGKeyArray
+        self,
+        state: MappoState,
+        parameters: PolicyParameters,
+        experience: Experience,
+        key: PRNGKeyArray,
     ) -> tuple[MappoState, PolicyParameters, dict[str, Scalar]]:
         """All epochs of the policy update on one rollout; `key` shuffles."""
         estimates = self._estimates(state.value_scale, parameters, experience)

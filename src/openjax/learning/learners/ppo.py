@@ -31,7 +31,7 @@ class Samples:
     target: jax.Array  # (...) of the values
 
 
-class Answer(NamedTuple):
+class NetworkOutputs(NamedTuple):
     """The outputs of the learning networks for samples."""
 
     log_prob: jax.Array  # (...) of what was done
@@ -60,7 +60,7 @@ class Objective:
     """Values, targets -> errors."""
     value_coefficient: float = 1.0
 
-    def loss(self, answer: Answer, samples: Samples) -> tuple[jax.Array, Terms]:
+    def loss(self, answer: NetworkOutputs, samples: Samples) -> tuple[jax.Array, Terms]:
         """Sum of the policy's and the values' loss; and its terms."""
         log_ratio = answer.log_prob - samples.log_prob
         ratio = jnp.exp(log_ratio)

@@ -12,7 +12,7 @@ import optax
 from jaxtyping import Array, Float, Int32, PRNGKeyArray
 
 from openjax.learning.collectives import own_keys
-from openjax.learning.learners.learner import Flown
+from openjax.learning.learners.learner import Experience
 from openjax.learning.rollout import Rollout
 from openjax.learning.train_state import TrainState
 from openjax.policy import Policy, PolicyParameters, PredictorSettings
@@ -116,7 +116,7 @@ class PredictorLearner:
         return self.optimiser.init(parameters.predictor)
 
     def learn(
-        self, state: Any, parameters: PolicyParameters, experience: Flown, key: PRNGKeyArray
+        self, state: Any, parameters: PolicyParameters, experience: Experience, key: PRNGKeyArray
     ) -> tuple[Any, PolicyParameters, dict[str, Scalar]]:
         """After the gradient steps on one rollout; `key` draws the windows."""
         rollout = experience.rollout
