@@ -2,7 +2,7 @@
 `dev` extra.
 
     python -m experiments.diagnosis.rotorpy_cases --seed 101 --each 4 --logs LOGS --answers
-    ANSWERS.json [--set corrections] [--jobs 8]
+    ANSWERS.json [--jobs 8]
 
 Rigid body, rotors, hub drag, parasitic drag, flapping moment, translational lift, motor
 lag, wind, the controller (SE3Control, motor speeds at 250 Hz from the measured state)
@@ -22,15 +22,12 @@ from experiments.diagnosis import vehicle as v
 from experiments.diagnosis.answer_key import HIDDEN, accepted
 from experiments.diagnosis.firmware import SAMPLE
 from experiments.diagnosis.generate import case_parser, in_processes, write_answers
-from experiments.diagnosis.rotorpy_corrections import BEFORE, CORRECTIONS
 from experiments.diagnosis.rotorpy_flights import SECONDS, fly, trajectory
 from experiments.diagnosis.rotorpy_kinds import KINDS
 from experiments.diagnosis.rows import log_rows
 from experiments.flying.single_thread import use_single_thread
 
 PATHS = ("circle", "eight", "rocking", "yawing")
-SETS = {"causes": KINDS, "corrections": CORRECTIONS}
-EVERY = KINDS | CORRECTIONS
 LEAST = 4.0 / SAMPLE + 1  # samples that a flight must last
 
 
@@ -38,8 +35,8 @@ def make_case(job):
     """Fly and write one case; returns its answer."""
     seed, number, kind, folder = job
     rng = np.random.default_rng(np.random.SeedSequence([17, seed, number]))
-    draw, effects, _, exposing = EVERY[kind]
-    told = BEFORE.get(kind) or v.draw_told(rng)
+    draw, effects, _, exposing = KINDS[kind]
+    told = v.draw_told(rng)
     if "mass" in effects:  # a vehicle whose mass is the cause wasn't weighed
         told = replace(told, weighed=False)
     changed, wind, said = draw(rng, told, v.MAX_SPEED * np.sqrt(told.hover))
@@ -96,7 +93,7 @@ def floor_of(told, drawn, joined, flights):
 
 def answer(name, kind, told, drawn, joined, flights, said):
     """The answer of one case; `said`: magnitudes of each effect."""
-    _, effects, form, _ = EVERY[kind]
+    _, effects, form, _ = KINDS[kind]
     seen, floor = floor_of(told, drawn, joined, flights)
     known = np.isfinite(floor)
     severity = float(np.sqrt(np.where(known, seen / floor**2, 0.0).max()))
@@ -128,10 +125,9 @@ def answer(name, kind, told, drawn, joined, flights, said):
 def main():
     parser = case_parser(__doc__)
     parser.add_argument("--each", type=int, default=4, help="cases of each kind")
-    parser.add_argument("--set", choices=SETS, default="causes")
     options = parser.parse_args()
     use_single_thread()
-    kinds = [kind for kind in SETS[options.set] for _ in range(options.each)]
+    kinds = [kind for kind in KINDS for _ in range(options.each)]
     order = np.random.default_rng(options.seed).permutation(len(kinds))
     jobs = [(options.seed, n, kinds[i], str(options.logs)) for n, i in enumerate(order, 1)]
     answers = sorted(in_processes(make_case, jobs, options.jobs), key=lambda a: a["case"])

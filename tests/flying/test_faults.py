@@ -10,11 +10,11 @@ import pytest
 from openjax.flying.safety import step
 from openjax.flying.state import Event, Mode, Request, initial_state
 from openjax.vehicle import load_vehicle
-from openjax.virtual_crazyflie.simulated import SimulatedSwarm
 from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 from tests.flying.fault_injection import estimates
 from tests.flying.fault_injection.fault_worlds import fly
 from tests.flying.fault_injection.faults import BEYOND, FALL, KINDS, finite, well
+from tests.flying.fault_injection.simulated import SimulatedSwarm
 
 
 @pytest.mark.slow

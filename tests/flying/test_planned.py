@@ -15,8 +15,8 @@ from openjax.flying.set_point import from_action
 from openjax.flying.state import Drone, Event, Mode, Request, SafetySettings, initial_state
 from openjax.pursuit.environment import THRUST_LIMIT
 from openjax.vehicle import load_vehicle
-from openjax.virtual_crazyflie.simulated import SimulatedSwarm
 from openjax.virtual_crazyflie.vehicles import VirtualVehicles
+from tests.flying.fault_injection.simulated import SimulatedSwarm
 
 
 def flown(segments, effects=None):

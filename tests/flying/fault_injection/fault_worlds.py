@@ -30,7 +30,6 @@ from openjax.pursuit import PursuitSettings, find_scenario, scenario_task
 from openjax.pursuit.environment import THRUST_LIMIT
 from openjax.vehicle import load_vehicle
 from openjax.virtual_crazyflie.firmware import LEVEL_AFTER
-from openjax.virtual_crazyflie.simulated import SimulatedSwarm, Uplink
 from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 from tests.flying.fault_injection.faults import (
     ASLEEP,
@@ -40,6 +39,7 @@ from tests.flying.fault_injection.faults import (
     draw_fault,
     outcome,
 )
+from tests.flying.fault_injection.simulated import SimulatedSwarm, Uplink
 
 LATEST = 4.0
 """Nothing begins to go wrong after (s)."""
