@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openjax.flying.controller import Pose, moved_on, nominal_airframe
-from openjax.flying.judge import PoseHistory, Verdict, agree, follows, judge, pose_limits
+from openjax.flying.judge import PoseHistory, Verdict, agree, follows, judge
+from openjax.flying.state import initial_state
 
-LIMITS = pose_limits(nominal_airframe(), 0.06)
+LIMITS = initial_state([], airframe=nominal_airframe()).limits
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 HERE = Pose(0.0, (0.4, 0.0, 0.5), (0.3, 0.0, 0.0), LEVEL, (0.0, 0.0, 0.1))
 

@@ -8,9 +8,10 @@ The flight is written as a case that `openjax diagnose` reads.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -171,74 +172,78 @@ class Prepared(NamedTuple):
     seconds: float = math.inf  # that it may take in the air
 
 
+class Course(NamedTuple):
+    """What is flown, a policy's game or a plan, before its vehicle is known."""
+
+    game: Callable  # airframe -> the game, compiled
+    airframe: str | None  # the usual one's name; None: a plan is for any
+    about: dict  # for flight.json
+    seconds: float  # that it may take in the air
+    remarks: tuple[str, ...] = ()
+
+
 def prepare(arguments: FlyCommand) -> Prepared:
     """Policy, layout and vehicle, compiled; vehicles aren't needed for it."""
     from openjax.flying import real_time
     from openjax.flying.controller import airframe_of
-    from openjax.flying.game import Game
     from openjax.flying.loop import flight_state
-    from openjax.pursuit import PursuitSettings, find_scenario, scenario_task
-    from openjax.store.policies import load_policy
     from openjax.vehicle.vehicle_file import load_vehicle_file
 
     real_time.prepare()
-    if arguments.plan is not None:
-        return _prepare_plan(arguments)
+    course = _game(arguments) if arguments.plan is None else _plan(arguments)
+    vehicle = load_vehicle_file(arguments.vehicle or course.airframe)
+    session = _session(arguments)  # before the game, which takes its time to compile
+    game = course.game(airframe_of(vehicle.vehicle))
+    state = flight_state(game, len(session.uris), arguments.safety)
+    remarks = course.remarks
+    if course.airframe not in (None, vehicle.airframe):
+        other = f"the policy was trained for {course.airframe}, but {vehicle.airframe} flies"
+        remarks = (*remarks, other)
+    remarks = (*remarks, *_time_remark(arguments, course.seconds))
+    about = course.about | {"uris": session.uris}
+    return Prepared(game, state, session, vehicle, about, remarks, course.seconds)
+
+
+def _game(arguments: FlyCommand) -> Course:
+    """A policy's game in a layout."""
+    from openjax.flying.game import Game
+    from openjax.pursuit import PursuitSettings, find_scenario, scenario_task
+    from openjax.store.policies import load_policy
+
     name = arguments.policy
     line = ""
     if name is None:
         number = len(find_scenario(arguments.scenario, PursuitSettings()).pursuers)
         name, line = default_policy(PursuitSettings(num_pursuers=number))
     policy = load_policy(name)
-    settings = policy.settings.environment
-    scenario = find_scenario(arguments.scenario, settings)
+    scenario = find_scenario(arguments.scenario, policy.settings.environment)
     policy = policy.of_team(len(scenario.pursuers))
     settings = policy.settings.environment
     _check_numbers(arguments, len(scenario.pursuers), settings.num_pursuers)
-    vehicle = load_vehicle_file(arguments.vehicle or settings.airframe)
-    session = _session(arguments)  # before the game, which takes its time to compile
     # a layout may have more pillars than the policy was trained with; it observes the
     # nearest ones
     slots = max(settings.max_pillars, len(scenario.pillars))
-    game = Game(policy, scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario))
-    game.airframe = airframe_of(vehicle.vehicle)
-    uris = uris_of(arguments)
-    state = flight_state(game, len(uris), arguments.safety)
-    seconds = _longest_flight(arguments, settings)
-    remarks = _remarks(arguments, settings, vehicle, seconds)
-    if line:
-        remarks = (line, *remarks)
-    about = {"policy": policy.source, "scenario": scenario.name, "uris": uris}
-    about |= _draws(settings)
-    return Prepared(game, state, session, vehicle, about, remarks, seconds)
+    task = scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario)
+    length = settings.episode_length * settings.time_step
+    seconds = arguments.episodes * min(length, arguments.episode_seconds or math.inf)
+    about = {"policy": policy.source, "scenario": scenario.name}
+    if settings.strategies > 1:
+        period = round(settings.strategy_steps * settings.time_step, 6)
+        about |= {"strategies": settings.strategies, "strategy_seconds": period}
+    remarks = (line,) if line else ()
+    return Course(functools.partial(Game, policy, task), settings.airframe, about, seconds, remarks)
 
 
-def _draws(settings) -> dict:
-    """What flight.json says of a team that draws its strategies, beside what it drew."""
-    if settings.strategies == 1:
-        return {}
-    seconds = round(settings.strategy_steps * settings.time_step, 6)
-    return {"strategies": settings.strategies, "strategy_seconds": seconds}
-
-
-def _prepare_plan(arguments: FlyCommand) -> Prepared:
+def _plan(arguments: FlyCommand) -> Course:
     """A plan in a policy's place."""
     from openjax.flights.manoeuvres import PERIOD
     from openjax.flights.plans import read_plan
-    from openjax.flying.controller import airframe_of
-    from openjax.flying.loop import flight_state
     from openjax.flying.planned import PlannedFlight
-    from openjax.vehicle.vehicle_file import load_vehicle_file
 
-    vehicle = load_vehicle_file(arguments.vehicle)
     plan = read_plan(arguments.plan)
-    game = PlannedFlight(plan, airframe_of(vehicle.vehicle))
-    state = flight_state(game, 1, arguments.safety)
     source = f"plan {arguments.plan}"
-    about = {"policy": source, "scenario": source, "uris": arguments.uri}
-    seconds = len(plan) * PERIOD
-    remarks = _time_remark(arguments, seconds)
-    return Prepared(game, state, _session(arguments), vehicle, about, remarks, seconds)
+    about = {"policy": source, "scenario": source}
+    return Course(functools.partial(PlannedFlight, plan), None, about, len(plan) * PERIOD)
 
 
 def _session(arguments: FlyCommand):
@@ -246,30 +251,15 @@ def _session(arguments: FlyCommand):
     from openjax.flying.motion_capture import find_feed
     from openjax.flying.session import SessionSettings
 
-    feed = find_feed(arguments.motion_capture) if arguments.motion_capture else None
     uris = uris_of(arguments)
     body_logs = arguments.body_logs
     if body_logs is None:
         # a radio has less room, which commands and poses need first
         body_logs = 5 if all(uri.startswith("udp:") for uri in uris) else 1
+    feed = find_feed(arguments.motion_capture) if arguments.motion_capture else None
     return SessionSettings(
         uris, body_logs, arguments.watchdog, arguments.guard, arguments.guard_after, feed
     )
-
-
-def _longest_flight(arguments: FlyCommand, settings) -> float:
-    """s that the games of this flight take at most."""
-    length = settings.episode_length * settings.time_step
-    return arguments.episodes * min(length, arguments.episode_seconds or math.inf)
-
-
-def _remarks(arguments: FlyCommand, settings, vehicle, seconds: float) -> tuple[str, ...]:
-    """Remarks to read before the vehicles rise."""
-    remarks = _time_remark(arguments, seconds)
-    if vehicle.airframe == settings.airframe:
-        return remarks
-    other = f"the policy was trained for {settings.airframe}, but {vehicle.airframe} flies"
-    return (other, *remarks)
 
 
 def _time_remark(arguments: FlyCommand, seconds: float) -> tuple[str, ...]:

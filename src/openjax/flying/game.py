@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from openjax.flying.controller import Pose, airframe_of
+from openjax.flying.controller import Airframe, Pose, airframe_of
 from openjax.flying.real_time import compile_in_line
 from openjax.pursuit import Pursuit, Task
 from openjax.pursuit.teams import draw_strategies
@@ -100,11 +100,13 @@ class Game:
     Args:
       policy: what `openjax.load_policy` gives; only its settings and its call are used.
       task: pursuers' starts, evader's start, pillars.
+      airframe: what flies; that of the policy's vehicle, if it isn't given.
     """
 
-    def __init__(self, policy, task: Task):
+    def __init__(self, policy, task: Task, airframe: Airframe | None = None):
         self.task = jax.tree.map(np.asarray, task)
-        self.settings, self.airframe, first, tick = game_functions(policy)
+        self.settings, own_airframe, first, tick = game_functions(policy)
+        self.airframe = airframe or own_airframe
         # apart, so that nothing is divided by a distance of zero
         poses = [
             Pose(0.0, (0.3 * i, 0.0, 0.5), (0.0,) * 3, (1.0, 0.0, 0.0, 0.0))

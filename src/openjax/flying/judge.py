@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from openjax.flying.controller import Airframe, Pose, moved_on, numbers_of
+from openjax.flying.controller import Pose, moved_on, numbers_of
 
 
 class Verdict(StrEnum):
@@ -79,11 +79,6 @@ class PoseLimits:
     """Angle (rad) between them: a body marked by hand stands within 10 degrees, as does
     an estimate of the yaw.
     """
-
-
-def pose_limits(airframe: Airframe, horizon: float) -> PoseLimits:
-    """The limits of a vehicle's poses. `horizon`: see `PoseLimits`."""
-    return PoseLimits(airframe.acceleration, airframe.angular_acceleration, horizon=horizon)
 
 
 def judge(

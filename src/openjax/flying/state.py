@@ -9,7 +9,7 @@ from typing import Annotated, NamedTuple
 from openjax.flying.controller import Airframe, Pose, Vector, nominal_airframe
 from openjax.flying.crtp import Supervisor
 from openjax.flying.innovations import Innovations
-from openjax.flying.judge import PoseHistory, PoseLimits, Verdict, pose_limits
+from openjax.flying.judge import PoseHistory, PoseLimits, Verdict
 from openjax.flying.set_point import MOTORS_OFF, SetPoint
 from openjax.ranges import Interval, check_intervals
 from openjax.vehicle.arena import Arena
@@ -241,7 +241,9 @@ def initial_state(
     """
     airframe = airframe or nominal_airframe()
     settings = settings or SafetySettings()
-    limits = pose_limits(airframe, settings.pose_timeout)
+    limits = PoseLimits(
+        airframe.acceleration, airframe.angular_acceleration, horizon=settings.pose_timeout
+    )
     drones = tuple(Drone() for _ in starts)
     return State(
         drones=drones,

@@ -103,7 +103,8 @@ def load_vehicle(airframe: str | Path = NOMINAL, dtype=jnp.float32) -> Vehicle:
     Raises:
       UserError: the file is missing, isn't MJCF or lacks a part of a vehicle.
     """
-    numbers = read_mjcf(str(find_mjcf(airframe).resolve()))
+    path = find_mjcf(airframe).resolve()
+    numbers = read_mjcf(str(path))
     return Vehicle(**{name: jnp.asarray(value, dtype) for name, value in numbers.items()})
 
 

@@ -96,7 +96,8 @@ def load_vehicle_file(path: str | Path | None = None, dtype=jnp.float32) -> Vehi
         )
     if path.is_dir():
         path = path / "vehicle.toml"
-    return _from_tables(read_toml(path, "vehicle file"), path, dtype)
+    tables = read_toml(path, "vehicle file")
+    return _from_tables(tables, path, dtype)
 
 
 def save_vehicle_file(path: str | Path, vehicle_file: VehicleFile) -> None:
