@@ -26,7 +26,7 @@ import os, signal, sys, time
 from pathlib import Path
 from openjax.flying.flight_record import FlightRecord
 from openjax.flying.recorder import NewCase, Recorder
-from openjax.flying.record_pipe import Kind, Teller
+from openjax.flying.record_pipe import RecordKind, Teller
 from openjax.flying.set_point import SetPoint, RATES
 
 if __name__ == "__main__":
@@ -41,7 +41,7 @@ if __name__ == "__main__":
         if k in (30, 130):  # for a second it gets no turn
             os.kill(recorder._process.pid, signal.SIGSTOP if k == 30 else signal.SIGCONT)
         now = time.perf_counter()
-        links.row(Kind.POSES, 0, (now, 4.0, now, *range(13)))
+        links.row(RecordKind.POSES, 0, (now, 4.0, now, *range(13)))
         record.keep((now, now, 0), [now], [now], [SetPoint(RATES, thrust=.5)])
     print(k, flush=True)
     os.kill(os.getpid(), signal.SIGKILL)

@@ -61,7 +61,11 @@ def test_a_second_of_the_stage_is_a_second_of_the_game():
 def test_pursuers_come_nearer():
     class Fast(FirstFlightsSettings):
         WORLDS = 48
+        STEPS = 15
         LEARNING_RATE = 5e-3
+        CRASH = 20.0
+        CRASH_SMOOTH = 0.012
+        BREACH = 10.0
 
     how = Fast(updates=160)
     environment = first_game(Pursuit(GAME), how)
