@@ -19,6 +19,7 @@ from openjax.gap.reference import differs, join, trim_of, trimmed_before, with_s
 from openjax.gap.report.page import page_of
 from openjax.gap.residual import HORIZONS, calibration, conformal_p
 from openjax.vehicle import load_vehicle
+from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.vehicle_file import load_vehicle_file
 
 
@@ -165,3 +166,17 @@ def test_a_slower_motor_is_named_and_one_that_was_as_slow_before_is_no_change(tm
         assert "reference" in report.reference
         assert report.trims.effects == expected
     assert "Trims beside the reference" in page_of(report)
+
+
+@pytest.mark.slow
+def test_wind_drags_by_the_drag_that_the_reference_has(tmp_path):
+    """The vehicle had its drag before, in still air: it isn't dragged twice, nor by a
+    stronger wind.
+    """
+    for name, effect in (("before", "rotor_drag"), ("since", "wind")):
+        make_case(SampleFlightsCommand(tmp_path / name, effect=(effect,)))
+    report = diagnose_folder(tmp_path / "since", [tmp_path / "before"])
+    assert report.effects == ("wind",)
+    for name in ("x", "y", "drag"):
+        low, high = report.parameters["wind"][name].interval90
+        assert low < EFFECTS["wind"].card.sample[name] < high

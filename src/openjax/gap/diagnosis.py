@@ -14,7 +14,7 @@ from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence, gather, with_identification
 from openjax.gap.intervals import estimates, links
 from openjax.gap.model.bounds import BOUND
-from openjax.gap.model.library import CARDS, PLACE, library, path_of
+from openjax.gap.model.library import ABSENT, CARDS, PLACE, library, path_of
 from openjax.gap.planning.beliefs import acts_in_physics
 from openjax.gap.probabilities import agreeing, probabilities
 from openjax.gap.reference import OF_DAYS, borne_out, differs, join, read_reference, trimmed_before
@@ -263,7 +263,9 @@ def _reference_in_words(evidence: Evidence, effects) -> str:
         f"{e} {p} was {evidence.baseline.theta[PLACE[e, p]]:.3g} {_unit(e, p)}".strip()
         for e in effects
         for p in (f.name for f in CARDS[e].fitted)
-        if (e, p) in PLACE and e not in OF_DAYS
+        if (e, p) in PLACE
+        and e not in OF_DAYS
+        and evidence.baseline.theta[PLACE[e, p]] != ABSENT[PLACE[e, p]]
     ]
     text = "Held against the reference flights of the same vehicle"
     text += f", in which {', '.join(values)}." if values else "."

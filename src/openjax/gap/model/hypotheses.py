@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from openjax.background import side_by_side
-from openjax.gap.model.library import ABSENT, CARDS, PLACE, Library, places, prior
+from openjax.gap.model.library import ABSENT, CARDS, PLACE, Library, absent_beside, places, prior
 from openjax.gap.model.replay import GROUPS, SKIP, Replay, block_count
 from openjax.gap.model.whitening import fit_noise
 from openjax.gap.shapes import Parameters, Rows
@@ -94,11 +94,11 @@ def fit_set(
     are worked out anew.
     """
     effects = tuple(effects)
-    theta = replay.absent.copy()  # what isn't in the set is absent
-    for effect in effects:
-        place = places((effect,))
-        theta[place] = (_starts(effect, replay)[0] if start is None else start)[place]
-    fit = _at(replay, effects, theta)
+    if start is None:
+        start = replay.absent.copy()
+        for effect in effects:
+            start[places((effect,))] = _starts(effect, replay)[0][places((effect,))]
+    fit = _at(replay, effects, replay.alone(effects, start))
     for _ in range(rounds if effects else 0):
         previous = fit
         fit = _descend(fit, iterations)
@@ -241,7 +241,7 @@ def _starts(effect: str, replay: Replay) -> np.ndarray:
     nothing acts as its card says, for a vehicle of this size; what other estimators
     told is where they have it.
     """
-    absent = replay.absent
+    absent = absent_beside((effect,), replay.absent)
     starts = np.repeat(absent[None], 1 + len(CARDS[effect].others), 0)
     at = places((effect,))
     starts[:, at] = [[p.start for p in CARDS[effect].fitted], *CARDS[effect].others]

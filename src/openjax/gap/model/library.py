@@ -90,6 +90,21 @@ def growths(vehicle) -> Parameters:
     return np.array([*factors, 1.0, 1.0])
 
 
+def absent_beside(effects, absent: Parameters) -> Parameters:
+    """(P,) a vehicle that has `absent` while nothing acts, as far as none of these
+    `effects` takes its place: wind drags by the drag that is known.
+    """
+    d_xy, d_z = absent[places(("rotor_drag",))]
+    if "wind" not in effects or d_xy <= 0.0:
+        return absent
+    absent = absent.copy()
+    absent[places(("rotor_drag",))] = ABSENT[places(("rotor_drag",))]
+    usual = {p.name: p.mean for p in CARDS["wind"].fitted}
+    absent[PLACE["wind", "drag"]] += d_xy - usual["drag"]
+    absent[PLACE["wind", "along"]] += max(d_z, 0.0) / d_xy - usual["along"]
+    return absent
+
+
 def prior(
     effects, absent: Parameters = ABSENT, size_factors: Parameters | None = None, other_sizes=None
 ) -> tuple[Int[np.ndarray, " own"], Float[np.ndarray, " own"], Float[np.ndarray, "own own"]]:
@@ -101,6 +116,7 @@ def prior(
     index = []
     means = []
     blocks = []
+    absent = absent_beside(effects, absent)
     for effect in effects:
         card = CARDS[effect]
         at = places((effect,))

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from scipy.linalg import solve_triangular
 
 from openjax.flights.track import Track
-from openjax.gap.model.library import ABSENT, CARDS, PLACE, STEP, prior
+from openjax.gap.model.library import ABSENT, CARDS, PLACE, STEP, absent_beside, places, prior
 from openjax.gap.model.nuisances import OF_A_BLOCK, SIZE, columns_of
 from openjax.gap.model.prediction import FORCE, RATES, VELOCITY, Physics, make_physics
 from openjax.gap.model.whitening import Noise, first_noise, whiten
@@ -86,6 +86,12 @@ class Replay:
     def prior(self, effects: Collection[str]):
         """As `library.prior` has it, of this vehicle and what others told of it."""
         return prior(effects, self.absent, self.size_factors, self.other_sizes)
+
+    def alone(self, effects: Collection[str], theta: Parameters) -> Parameters:
+        """(P,) these effects as in theta (P,), and nothing else."""
+        out = absent_beside(effects, self.absent).copy()
+        out[places(effects)] = theta[places(effects)]
+        return out
 
     @cached_property
     def flights(self) -> tuple[str, ...]:

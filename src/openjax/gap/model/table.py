@@ -122,11 +122,11 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
     others = [e for e in singles or () if e not in within]
     index = np.concatenate([fit.index, places(others)])
     points = []
-    for effect in (*others, *within):
-        point = fit.theta.copy()
-        at = places((effect,))
-        point[at] = replay.absent[at] if effect in within else singles[effect].theta[at]
-        points.append(point)
+    for effect in others:
+        theta = fit.theta.copy()
+        theta[places((effect,))] = singles[effect].theta[places((effect,))]
+        points.append(replay.alone((*within, effect), theta))
+    points += [replay.alone([e for e in within if e != effect], fit.theta) for effect in within]
     columns = fit.columns if singles is None else replay.linearise(fit.theta, index)
     predictions = [np.zeros((0, *y.shape)) for y in replay.measurements]
     if points:
