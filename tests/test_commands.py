@@ -36,7 +36,7 @@ TINY = (
     "--num_envs 16 --rollout_length 10 --environment.episode_length 20 --environment.physics rigid "
     "--environment.time_step 0.01 --environment.substeps 1 "
     "--network.features 8 --network.heads 1 --network.critic_encoder layers "
-    "--predictor.units 4 --predictor.windows 4 --predictor.steps 2 --predictor.horizons 1 2 "
+    "--predictor.units 4 --predictor.windows 4 --predictor.horizons 1 2 "
     "--mappo.minibatches 2 --generator.capacity 8 "
     "--validation_interval 3 --validation_episodes 4 "
     "--first_flights.updates 1"

@@ -27,7 +27,7 @@ MOST = {"words": 600, "rows": 10, "line": 400, "sentences": 3, "pictures": 1}
 """Of a page of results: words of prose, rows of its one table, characters of a line,
 sentences of the answer, pictures.
 """
-COMMIT = re.compile(r"\battic:|\b(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,40}\b")
+COMMIT = re.compile(r"\b(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,40}\b")
 
 
 def prose_of(text: str) -> list[str]:

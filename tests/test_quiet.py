@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 TINY = (
     "--num_envs 16 --rollout_length 10 --environment.episode_length 20 --environment.time_step .01 "
     "--environment.substeps 1 --network.features 8 --network.heads 1 --predictor.units 4 "
-    "--predictor.windows 4 --predictor.steps 2 --predictor.horizons 1 2 --mappo.minibatches 2 "
+    "--predictor.windows 4 --predictor.horizons 1 2 --mappo.minibatches 2 "
     "--generator.capacity 8 --validation_interval 1 --validation_episodes 4 "
     "--first_flights.updates 1 "
     "--total_steps 320 --layout_episodes 4 --compare_with none"

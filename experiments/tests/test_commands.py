@@ -30,7 +30,7 @@ PAGES = [
     *(ROOT / "docs" / "tutorials").glob("*.md"),
     *RESULTS.rglob("*.md"),
 ]
-COMMIT = re.compile(r"\battic:|\b(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,40}\b")
+COMMIT = re.compile(r"\b(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,40}\b")
 COMMAND = re.compile(
     rf"(?:^|(?<=; )|(?<=then ))(openjax (?:{'|'.join(COMMANDS)})|"
     r"python -m (?:openjax|experiments|tests)\.[\w.]+)(?= )((?:'[^']*'|[^'])*?)(?=; |, |$| \(| #| &| then)"

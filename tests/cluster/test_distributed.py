@@ -26,7 +26,7 @@ OPTIONS = """
     --preset quick --environment.time_step 0.01 --environment.substeps 1
     --environment.physics mjx --environment.episode_length 20 --environment.capture_radius 1.0
     --network.features 8 --network.heads 1 --network.critic_encoder layers
-    --predictor.units 4 --predictor.windows 2 --predictor.steps 1
+    --predictor.units 4 --predictor.windows 2
     --predictor.horizons 1 2 --mappo.minibatches 2 --generator.capacity 8
     --first_flights.updates 0 --generator.success_low 0.0 --generator.success_high 1.0 --generator.episodes_per_task 2
     --num_envs 32 --rollout_length 10 --restart_every 2 --restart_steps 10 --total_steps 100000000 --validation_episodes 2

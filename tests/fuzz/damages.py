@@ -13,7 +13,7 @@ from tests.fuzz.mutations import changed_bytes
 
 TINY = """--preset quick --environment.time_step 0.01 --environment.substeps 1
     --environment.episode_length 20 --environment.physics rigid --environment.capture_radius 1.0
-    --network.features 8 --network.heads 2 --predictor.units 4 --predictor.windows 2 --predictor.steps 1
+    --network.features 8 --network.heads 2 --predictor.units 4 --predictor.windows 2
     --predictor.horizons 1 2 --mappo.minibatches 2 --generator.capacity 8
     --generator.episodes_per_task 2 --num_envs 16 --rollout_length 10 --validation_episodes 2 --validation_interval 20
     --layout_episodes 1 --compare_with none --first_flights.updates 0""".split()

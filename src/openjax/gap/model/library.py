@@ -92,17 +92,22 @@ def growths(vehicle) -> Parameters:
 
 def absent_beside(effects, absent: Parameters) -> Parameters:
     """(P,) a vehicle that has `absent` while nothing acts, as far as none of these
-    `effects` takes its place: wind drags by the drag that is known.
+    `effects` takes its place.
     """
-    d_xy, d_z = absent[places(("rotor_drag",))]
-    if "wind" not in effects or d_xy <= 0.0:
-        return absent
-    absent = absent.copy()
-    absent[places(("rotor_drag",))] = ABSENT[places(("rotor_drag",))]
-    usual = {p.name: p.mean for p in CARDS["wind"].fitted}
-    absent[PLACE["wind", "drag"]] += d_xy - usual["drag"]
-    absent[PLACE["wind", "along"]] += max(d_z, 0.0) / d_xy - usual["along"]
-    return absent
+    out = absent.copy()
+    for effect in effects:
+        card = CARDS[effect]
+        if card.takes_over is None:
+            continue
+        other, numbers_of_it = card.takes_over
+        at = places((other,))
+        if (absent[at] != ABSENT[at]).any():
+            out[at] = ABSENT[at]
+            values = {p.name: float(absent[PLACE[other, p.name]]) for p in CARDS[other].fitted}
+            usual = {p.name: p.mean for p in card.fitted}
+            for name, value in numbers_of_it(values).items():
+                out[PLACE[effect, name]] += value - usual[name]
+    return out
 
 
 def prior(

@@ -246,6 +246,10 @@ class Card:
     """The same where motor commands are duty cycles."""
     nuisance_samples: Mapping[str, float] = field(default_factory=dict)
     """The same where motor commands are single samples, whose rows hide the rest."""
+    takes_over: tuple[str, Callable[[Mapping[str, float]], Mapping[str, float]]] | None = None
+    """Another effect that a vehicle may always have and that is part of this one, and how that
+    one's values {parameter: value} are said by this one's parameters.
+    """
     weighed: bool = False
     """True if a weighed vehicle rules it out."""
     of_others: bool = False

@@ -20,6 +20,7 @@ def wrench(parameters, context):
 
 
 STEEPEST = 2.0  # times as much drag along the rotors' axes, twice what is usual
+LEAST_DRAG = 0.001  # N s/m, below which none is told
 FASTEST_UP = 1.0  # m/s, the end of the usual range
 LEVEL = 0.2  # of the wind's speed that may rise or fall: a fan isn't quite level
 
@@ -37,6 +38,12 @@ def drags(value, deviation):
         and 0.0 < value["along"] < STEEPEST
         and abs(value["z"]) < max(FASTEST_UP, level)
     )
+
+
+def by_its_drag(value):
+    """The drag in still air, in air that moves."""
+    drag = max(value["d_xy"], LEAST_DRAG)
+    return {"drag": drag, "along": max(value["d_z"], 0.0) / drag}
 
 
 EFFECT = Effect(
@@ -70,6 +77,7 @@ EFFECT = Effect(
         coordinate="body velocity",
         log_odds=VERY_RARE,
         possible=drags,
+        takes_over=("rotor_drag", by_its_drag),
         sample={"x": 1.2, "y": -0.8, "drag": 0.015},
         # air that moves along z pushes as a wrong thrust does
         practical={"x": 0.1, "y": 0.1},
