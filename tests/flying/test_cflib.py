@@ -24,6 +24,7 @@ from openjax.flying.controller import nominal_airframe
 from openjax.flying.crtp import Supervisor
 from openjax.flying.estimation import see
 from openjax.flying.flight_record import FlightRecord
+from openjax.flying.game import Play
 from openjax.flying.links import Links
 from openjax.flying.loop import FlightLoop, FlightPlan, flight_state
 from openjax.flying.motion_capture import MotionCaptured
@@ -140,10 +141,10 @@ class Hovering:
             for p in poses
         ]
         nothing = np.zeros(3)
-        return SimpleNamespace(
-            action=np.array(action), evader_position=nothing, evader_velocity=nothing, captured=self.steps > 10,
-            over=False, breaches=nothing, crashed=nothing.astype(bool),
-        )  # fmt: skip
+        captured = self.steps > 10
+        return Play(
+            np.array(action), nothing, nothing, captured, False, nothing, nothing.astype(bool)
+        )
 
 
 def flight_of(links, seconds, **more):
