@@ -17,15 +17,17 @@ from openjax.errors import UserError
 from openjax.files import check_room
 from openjax.flights.csv_table import read_csv
 from openjax.flying.flight_files import CaseFolder, GameLog, VehicleSamples
+from openjax.flying.flight_record import FlightRecord
 from openjax.flying.record_pipe import RecordKind, Teller
 from openjax.flying.recorder import NewCase, Recorder
-from openjax.flying.set_point import RATES
+from openjax.flying.set_point import RATES, SetPoint
 
 KILLED = """
 import os, signal, sys, time
 from pathlib import Path
 from openjax.flying.flight_record import FlightRecord
 from openjax.flying.recorder import NewCase, Recorder
+from openjax.flying.flight_record import FlightRecord
 from openjax.flying.record_pipe import RecordKind, Teller
 from openjax.flying.set_point import SetPoint, RATES
 
@@ -172,3 +174,23 @@ def test_a_flight_that_never_begins_leaves_nothing(tmp_path):
     finally:
         recorder.close()
     assert not (tmp_path / "log").exists()
+
+
+def test_links_that_are_killed_keep_nobody_waiting(tmp_path):
+    """The loop flies on without them: nothing more is to come from links that are gone."""
+    recorder = Recorder(NewCase(tmp_path / "log", {"vehicle.toml": b""}, {}), 1)
+    links = Teller(os.fdopen(os.dup(recorder.links_pipe.fileno()), "wb"))
+    record = FlightRecord(1, recorder.tell_tick, recorder.tell_game)
+    recorder.start()
+    try:
+        recorder.begin("")
+        record.begin_game()
+        links.row(RecordKind.POSES, 0, (0.0, 4.0, 0.0, *range(13)))
+        del links
+        for now in np.arange(1, 300) * 0.01:
+            record.keep((now, now, 0), [now], [now], [SetPoint(RATES, thrust=0.5)])
+        outcome = recorder.end(["the links' process is gone"])
+        assert not outcome.complaint and outcome.folder == tmp_path / "log"
+    finally:
+        recorder.close()
+    assert json.loads((tmp_path / "log" / "flight.json").read_text())["games"]

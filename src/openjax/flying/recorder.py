@@ -148,9 +148,14 @@ def keep(
     pipes = [loop, links]
     rest = {loop: b"", links: b""}
     due = time.perf_counter() + EVERY
-    patience = CLOSING / 2.0
-    while pipes and not (book.is_over and (book.knows_all or patience <= 0.0)):
-        patience -= REST * book.is_over
+    over_at = np.inf
+    while pipes:
+        now = time.perf_counter()
+        over_at = min(over_at, now if book.is_over else np.inf)
+        # links that are gone tell nothing more, others may yet tell of the last ticks
+        told_all = book.knows_all or links not in pipes or now > over_at + CLOSING / 2.0
+        if book.is_over and told_all:
+            break
         for pipe in wait(pipes, EVERY):
             data = os.read(pipe.fileno(), 1 << 20)
             rest[pipe] = book.take(rest[pipe] + data)
