@@ -23,7 +23,7 @@ except ModuleNotFoundError:
 def address() -> str:
     """The repository's, as pyproject.toml has it."""
     with (DOCS.parent / "pyproject.toml").open("rb") as file:
-        return tomllib.load(file)["tool"]["openjax"]["repository"]
+        return tomllib.load(file)["project"]["urls"]["Repository"]
 
 
 def text_cell(name: str, text: str) -> dict:

@@ -220,7 +220,7 @@ def game() -> str:
 
 def address() -> str:
     """The repository's, as pyproject.toml has it."""
-    return read_toml(ROOT / "pyproject.toml")["tool"]["openjax"]["repository"]
+    return read_toml(ROOT / "pyproject.toml")["project"]["urls"]["Repository"]
 
 
 def colab(tutorial: str) -> str:

@@ -2,6 +2,7 @@
 versions fit what it asks for.
 """
 
+import importlib
 import re
 import subprocess
 import sys
@@ -54,6 +55,34 @@ def test_wheel_of_the_sdist_runs_in_an_environment_of_its_own(tmp_path):
     assert "openjax " in run(venv / "bin" / "openjax", "--version", cwd=tmp_path)
     told = run(python, "-m", "openjax.evaluate", "--help", cwd=tmp_path)
     assert "--scenario" in told
+    openjax = venv / "bin" / "openjax"
+    run(openjax, "sample_flights", "flights", "--effect", "rotor_drag", cwd=tmp_path)
+    assert "mostly rotor drag" in run(openjax, "diagnose", "flights", cwd=tmp_path)
+    assert (tmp_path / "diagnosis" / "flights" / "report.html").is_file()
+
+
+def test_uvx_and_pipx_find_the_command_by_the_distributions_name():
+    project = PROJECT["project"]
+    module, _, name = project["scripts"][project["name"]].partition(":")
+    assert callable(getattr(importlib.import_module(module), name))
+
+
+def test_the_repositorys_address_is_one():
+    """What names it was made from pyproject.toml, or says the same."""
+    address = PROJECT["project"]["urls"]["Repository"]
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
+    pages += [path for path in (ROOT / "docs").rglob("*.md") if "_build" not in path.parts]
+    pages += (ROOT / "docs" / "notebooks").glob("*.ipynb")
+    named = {
+        found
+        for page in (ROOT / "CITATION.cff", *pages)
+        for found in re.findall(
+            r"\bgithub(?:\.com)?/[\w.-]+/openjax\b", page.read_text(encoding="utf-8")
+        )
+    }
+    place = address.removeprefix("https://github.com/")
+    assert named == {f"github.com/{place}", f"github/{place}"}
+    assert f"repository-code: {address}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
 
 def requirements():
