@@ -34,8 +34,8 @@ class Pending:
         self._future = future
 
     def __call__(self, seconds: float | None = None) -> Any:
-        """What was made. Raises its error, and `TimeoutError` where it isn't there after so
-        many seconds.
+        """Return what was made. Raises the error of its making, and `TimeoutError` if it isn't
+        there after so many seconds.
         """
         return self._future.result(seconds)
 

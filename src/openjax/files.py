@@ -79,7 +79,7 @@ def _read(path, what, language, parse: Callable[[str], Any]):
 
 
 def _example(folder: Path, language: str) -> str:
-    """Which files of a language a folder holds, in words."""
+    """Examples of the files of a language that a folder holds, in words."""
     names = sorted(file.name for file in folder.glob(f"*.{language.lower()}"))
     return f", such as {', '.join(names[:2])} in there" if names else ""
 

@@ -30,7 +30,7 @@ SHOW_CURSOR = b"\r\x1b[?25h\n"
 
 
 class _Watch:
-    """What is known to the thread that hears of signals."""
+    """State of the thread that waits for signals."""
 
     def __init__(self):
         self.descriptor: int | None = None
@@ -129,7 +129,7 @@ def clean_up(function: Callable[[], None]) -> contextlib.AbstractContextManager[
 
 
 def last_words(words: Callable[[], str]) -> contextlib.AbstractContextManager[None]:
-    """What the line says after the signal's name, should the process end inside."""
+    """Set what the line says after the signal's name, should the process end inside."""
     return _inside(_watch.last_words, words)
 
 

@@ -96,7 +96,7 @@ def _sweep(command) -> list[tuple[str, str, int, float]]:
 
 
 def _programs_and_step(rows) -> str | None:
-    """How long the step's programs take beside the step as one; None where one of them
+    """The seconds that the step's programs take beside the step as one; None where one of them
     wasn't measured.
     """
     phases = [row["seconds"] for row in rows if row["part"].startswith("- ")]

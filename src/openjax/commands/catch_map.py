@@ -164,8 +164,8 @@ def _about(command, game, policy):
 
 
 def _fly_all(flyer, knowing):
-    """What is known when scripted evaders have flown, when others have learned, and
-    when these have flown, and planned ones.
+    """Yield what is known after scripted evaders have flown, after others have learned, and after
+    those and the planning ones have flown.
     """
     command = flyer.command
     game = knowing.game

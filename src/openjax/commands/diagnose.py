@@ -146,8 +146,8 @@ def _compare(options: Options, members: Sequence["Member"]) -> None:
 
 
 def _checked_names(options: Options) -> list[str]:
-    """What the cases are called; all that can be wrong with where they're written to is
-    said before the work.
+    """The names of the cases. Anything wrong with the folders that they are written to is said
+    before the work.
     """
     if not options.cases:
         raise UserError(
@@ -178,8 +178,7 @@ def _outputs(options: Options, names: Sequence[str]) -> list[Path]:
 
 
 def _diagnosis(options: Options, folder: Path, name: str, tell: Callable[[str], None]) -> Answer:
-    """What causes a case's gap, or what changed since the reference, after its report
-    was written whole.
+    """The causes of a case's gap, or what changed since the reference, once its report is written.
     """
     from openjax.gap.folders import diagnose_folder
     from openjax.gap.report import write_report

@@ -148,8 +148,8 @@ def export(arguments: ExportCommand, tell: Callable[[str], None] = lambda step: 
 
 
 def _draws(policy):
-    """How the policy's team draws its strategies; None where it has one. Raises
-    UserError where that depends on what it sees.
+    """The rule by which the policy's team draws its strategies; None if it has one. Raises
+    UserError if the draw depends on what the team sees.
     """
     from openjax.export.c_program import DrawnStrategies
 

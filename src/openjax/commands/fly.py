@@ -173,7 +173,7 @@ class Prepared(NamedTuple):
 
 
 class Course(NamedTuple):
-    """What is flown, a policy's game or a plan, before its vehicle is known."""
+    """A policy's game or a plan that will be flown, before its vehicle is known."""
 
     game: Callable  # airframe -> the game, compiled
     airframe: str | None  # the usual one's name; None: a plan is for any
@@ -263,8 +263,8 @@ def _session(arguments: FlyCommand):
 
 
 def _time_remark(arguments: FlyCommand, seconds: float) -> tuple[str, ...]:
-    """What nobody notices in a flight of so many seconds by own estimates alone, and
-    that it will be cut short, where it will.
+    """A remark on what goes unnoticed in a flight of so many seconds by own estimates alone, and on
+    whether it will be cut short.
     """
     if arguments.motion_capture is not None:
         return ()

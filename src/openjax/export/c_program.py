@@ -29,7 +29,7 @@ _TEMPLATES.filters |= {"dims": dims, "number_rows": number_rows, "product": math
 
 
 class DrawnStrategies(NamedTuple):
-    """How a team draws which of its strategies it flies."""
+    """The rule by which a team draws the strategy that it flies."""
 
     strategies: int
     """As many."""
@@ -55,7 +55,7 @@ class DrawnStrategies(NamedTuple):
         return tuple(min(int(end * 2**32), 2**32 - 1) for end in ends)
 
     def in_words(self) -> str:
-        """What whoever runs an exported policy has to do."""
+        """Instructions for the program that calls an exported policy."""
         return (
             f"strategy is drawn by the program that calls the policy: a whole number from 0 to "
             f"{self.strategies - 1}, {self._odds_in_words()}, when a game begins and every "

@@ -148,7 +148,7 @@ def _unit(pair: SignalPair) -> list[Finding]:
 
 
 def _inversions(signals: Signals) -> list[Finding]:
-    """What flies by its thrust is upright on the mean."""
+    """Check that the vehicle is upright on the mean, as anything that flies by its thrust is."""
     if signals.quaternion is None:
         return []
     upright = float(rotation(signals.quaternion)[:, 2, 2].mean())

@@ -1,4 +1,4 @@
-"""When a flight is in the air: the one rule, which `Flight.airborne` keeps.
+"""The one rule that says when a flight is in the air; `Flight.airborne` keeps its answer.
 
 Off the ground motors give at least 40 % of their usual command, and the vehicle isn't at
 rest on the floor; shorter dips (half a second) are manoeuvres.

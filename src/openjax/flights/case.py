@@ -142,8 +142,8 @@ def _held_instead(path: Path) -> str:
 
 
 def _called_otherwise(path: Path) -> str:
-    """What to do where a folder has no vehicle.toml: an editor may have called it
-    Vehicle.toml or vehicle.toml.txt.
+    """Advice for a folder without a vehicle.toml: an editor may have called it Vehicle.toml or
+    vehicle.toml.txt.
     """
     names = sorted(file.name for file in path.iterdir())
     for name in names:

@@ -1,5 +1,5 @@
-"""When motors act: their commands against the turning of the body, without any fit of
-what acts.
+"""The moment at which motors act, from their commands and the turning of the body, without a fit of
+any cause.
 
 Torques turn the body at once: the angular acceleration that motors would make, through
 their lag, is where the cross-correlation with what the gyroscope reads is largest

@@ -152,8 +152,8 @@ def _turning(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _accelerating(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
-    """What the accelerometer feels (T, 3) and the acceleration of the position (T, 3),
-    m/s^2 in the world.
+    """The accelerometer's reading (T, 3) and the acceleration of the position (T, 3), m/s^2 in the
+    world.
     """
     if track.quaternion is None or track.position is None or track.specific_force is None:
         return None

@@ -1,5 +1,5 @@
-"""Which other axes, convention or labelling of a channel makes channels agree that
-contradict each other.
+"""A search for the axes, convention or labelling of a channel that makes contradicting channels
+agree.
 """
 
 import dataclasses
@@ -121,8 +121,8 @@ def _turns_with(signals: Signals, attitude: np.ndarray) -> bool:
 
 
 def _relabel(signals: Signals, pair: SignalPair, bad: list[SignalPair]) -> str:
-    """Which axes of a pair's channel hold what, if the best of all 48 labellings of it
-    makes the disagreeing pairs agree.
+    """The axes of a pair's channel under the best of all 48 labellings, if that makes the
+    disagreeing pairs agree.
     """
     values = getattr(signals, pair.holds)
     names = CHANNEL_COLUMNS.get(pair.holds, CHANNEL_COLUMNS["command_body_rates"])

@@ -27,7 +27,7 @@ MOST = 12
 
 @dataclass(frozen=True, eq=False)
 class LagAndDelay:
-    """How likely flights are by `delays` (D,), s: by each with the best lag for it."""
+    """The likelihood of flights under each of `delays` (D,), s, with the best lag for each."""
 
     delays: np.ndarray
     nats: np.ndarray

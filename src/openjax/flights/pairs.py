@@ -124,7 +124,7 @@ class SignalPair:
 
     @cached_property
     def agreement(self) -> Agreement:
-        """How well the two follow each other."""
+        """A measure of how well the two follow each other."""
         return agreement(self.signal, self.reference, self.band, self.derivatives)
 
     @property
@@ -144,7 +144,7 @@ class SignalPair:
         return bool(len(shares) and shares.min() > FITS)
 
     def in_words(self) -> str:
-        """Which columns contradict what, with the numbers."""
+        """The columns that contradict each other, with the numbers."""
         agreement = self.agreement
         worst = int(np.argmin(np.where(self.bad, agreement.correlation, np.inf)))
         columns = ", ".join(n for n, b in zip(self.names, self.bad, strict=True) if b)

@@ -93,8 +93,8 @@ def path_findings(signals: Signals) -> Iterator[Finding]:
 
 
 def _gain(path: np.ndarray, other: np.ndarray) -> tuple[float, float]:
-    """How far another path (T,) m moves where this one does, a steady drift aside, and
-    the standard error of that: infinite where this one hardly moves.
+    """The distance that another path (T,) m moves per metre of this one, a steady drift aside, and
+    its standard error, which is infinite if this one hardly moves.
     """
     time = np.arange(len(path)) / RATE
     columns = np.stack([path - path.mean(), time - time.mean()], 1)

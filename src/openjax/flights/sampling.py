@@ -110,8 +110,8 @@ def _may_stand_still(flight: Flight, channel: str, column: int) -> bool:
 
 
 def _hole(time: np.ndarray, rows: np.ndarray) -> str:
-    """Where the longest stretch without samples is, in words, if rows are there
-    meanwhile: else it is a gap in time, named already.
+    """The longest stretch without samples, in words, if rows go on meanwhile. Otherwise it is a gap
+    in time, which is named already.
     """
     steps = np.diff(time[rows])
     hole = int(np.argmax(steps))

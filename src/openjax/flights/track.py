@@ -173,8 +173,8 @@ def _command(take):
 
 
 def _sensors(take, floor):
-    """What each sensor says on the clock, by its name; heights count from the floor,
-    whose cushion is felt.
+    """Each sensor's readings on the clock, by its name. Heights count from the floor, since the
+    vehicle feels its cushion.
     """
     sensors = {sensor: take(sensor) for sensor in SENSORS}
     if sensors["position"] is not None:
@@ -334,7 +334,7 @@ def _means(at, values, begin, period, is_held):
 
 
 def _command_phase(part: Flight, period: float) -> float:
-    """When within a period (s, from the first row on) new commands begin: rows of the
+    """The time within a period (s, from the first row on) at which new commands begin: rows of the
     grid that begin there hold one each.
 
     A row that mixed two could not tell which of them had arrived.

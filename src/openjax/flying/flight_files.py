@@ -1,4 +1,4 @@
-"""What a flight leaves behind: a case that `openjax diagnose` reads, and `flight.json`
+"""The files that a flight leaves behind: a case that `openjax diagnose` reads, and `flight.json`
 about the flight.
 
 One log per game, with all vehicles in it: a row for each moment at which something was

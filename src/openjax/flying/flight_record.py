@@ -39,8 +39,8 @@ class GameNotes:
 
 
 class FlightRecord:
-    """What happened at every tick of a flight with `vehicles`; as numbers, since
-    objects would take two kilobytes a tick.
+    """A record of every tick of a flight with `vehicles`, kept as numbers, since objects would take
+    two kilobytes a tick.
 
     Args:
       vehicles: their number.

@@ -1,4 +1,4 @@
-"""What loop and links tell the recorder, and the pipe by which they do.
+"""The messages of loop and links to the recorder, and the pipe that carries them.
 
 Who tells never waits: what the pipe doesn't take is kept until the next record.
 """

@@ -173,7 +173,7 @@ def keep(
 
 
 class _Book:
-    """What the recorder was told, and what of it is written."""
+    """The messages that the recorder got, and which of them are written."""
 
     def __init__(self, case: NewCase, vehicles: int):
         self._case = case
@@ -251,7 +251,7 @@ class _Book:
         self._forget(until - REST)
 
     def _samples(self, i: int) -> VehicleSamples:
-        """What was told of vehicle i and isn't forgotten."""
+        """The samples of vehicle i that are still kept."""
         poses, bodies, captures = (
             np.array(self._rows[kind, i]).reshape(-1, width) for kind, width in WIDTHS.items()
         )

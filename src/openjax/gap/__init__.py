@@ -1,5 +1,5 @@
-"""What separates flights from the simulator: calibrating and diagnosing. Reading and
-checking: `openjax.flights`.
+"""The gap between flights and the simulator: calibration and diagnosis. `openjax.flights` reads and
+checks the logs.
 """
 
 import importlib

@@ -114,7 +114,8 @@ def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
 
 
 def _days_in_words(report: Report, of_days: Collection[str], trims: Change | None) -> str:
-    """What days have to do with the names, and with those of trims that aren't named."""
+    """A sentence on how days affect the named effects, and those that trims suggest without a name.
+    """
     if trims is not None and of_days:
         names = " and ".join(sorted(of_days)).replace("_", " ")
         return f" Trims differ as {names} would make them, and by no more than days do."
@@ -254,8 +255,8 @@ def _report(
 
 
 def _reference_in_words(evidence: Evidence, effects) -> str:
-    """What the named effects' parameters were in the reference flights, and what may
-    differ between days that nothing tells.
+    """The named effects' parameters in the reference flights, and what may differ unseen between
+    days.
     """
     if evidence.baseline is None:
         return ""
@@ -292,8 +293,8 @@ def _runner_up(chances, effects, equivalent) -> str:
 
 
 def _beside_segments(evidence: Evidence, effects) -> str:
-    """What to fly and log for the first of `effects` that no segment of `openjax plan`
-    shows, within reach of who logged these flights: nobody is sent for a second vehicle.
+    """Advice on flying and logging for the first of `effects` that no segment of `openjax plan`
+    shows and these loggers can reach: nobody is sent for a second vehicle.
     """
     alone = not any(len(t.neighbours) for t in evidence.tracks)
     for effect in effects:
@@ -304,7 +305,7 @@ def _beside_segments(evidence: Evidence, effects) -> str:
 
 
 def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
-    """What the vehicle's numbers and the sensors' mounting took, in usual sizes; a
+    """The values that the vehicle's numbers and the sensors' mounting took, in usual sizes. A
     number at its bound says so.
     """
     names = np.array(evidence.replay.nuisance_names)[evidence.replay.is_shared]

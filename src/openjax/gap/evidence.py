@@ -33,7 +33,7 @@ from openjax.gap.model.replay import Replay
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What was read of a case."""
+    """The data that were read from a case."""
 
     case: Case
     library: Library
@@ -60,15 +60,15 @@ class Evidence:
 
     @property
     def charge_unknown(self) -> bool:
-        """Whether a battery's charge acts unseen: motors are duty cycles, and no
-        voltage was logged.
+        """True if a battery's charge acts unseen: motors are duty cycles, and no voltage was
+        logged.
         """
         silent = any(t.voltage is None for t in self.tracks)
         return silent and self.pwm
 
     @property
     def pwm(self) -> bool:
-        """Whether motor commands are duty cycles."""
+        """True if motor commands are duty cycles."""
         return self.case.vehicle_file.motor.command == "pwm"
 
     @property

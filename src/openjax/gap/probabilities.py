@@ -1,4 +1,4 @@
-"""How sure the words are: the probability of each cause to be the strongest.
+"""The probability of each cause to be the strongest.
 
 Two uncertainties, each with a number of its own: whether an effect acts (how often its
 set is chosen, `selection`), and which part is the largest (the shares' bootstrap). What

@@ -38,9 +38,9 @@ OTHER_NAMES = tuple(e for e in CARDS if CARDS[e].log_odds <= VERY_RARE and e not
 
 
 def read_reference(case: Case, progress=None) -> Baseline:
-    """What the vehicle is like, by all flights of a reference case: the effects that a
-    diagnosis would choose, of which those of the vehicle's form stay, and the numbers
-    that every vehicle has. Raises UserError as `gather`.
+    """The vehicle's description from all flights of a reference case: the effects that a diagnosis
+    would choose, of which those of the vehicle's form stay, and the numbers that every vehicle has.
+    Raises UserError as `gather`.
     """
     effects = Library(tuple(e for e in library().effects if e not in (*OF_DAYS, *OTHER_NAMES)))
     evidence = gather(case, effects, progress, reference=True)
@@ -177,8 +177,8 @@ def _another_day(evidence: Evidence, fit: SetFit, effects) -> tuple[tuple[str, .
 
 
 def _is_lasting(name: str, motor_clock: bool) -> bool:
-    """Whether a number ("effect parameter") is the vehicle's on any day: what motors on
-    a clock of their own make of a lag isn't.
+    """True if a number ("effect parameter") is the vehicle's on any day. A lag that comes from
+    motors on a clock of their own isn't.
     """
     effect, parameter = name.split(" ")
     is_time = EFFECTS[effect].parameters[parameter].unit == "s"
@@ -206,10 +206,9 @@ def join(cases: Sequence[Case]) -> Case:
 
 
 def differs(channel: Channel, effect: str, baseline: Baseline | None) -> bool:
-    """Whether a channel tells another size of an effect than the reference does: a
-    parameter is further away than the errors of both, and than forms may be wrong by. A
-    reference in which it doesn't act says the same only where it is nearer to the case
-    than to nothing.
+    """True if a channel gives another size of an effect than the reference does: a parameter is
+    further away than the errors of both, and than forms may be wrong by. A reference in which it
+    doesn't act says the same only where it is nearer to the case than to nothing.
     """
     channel_before = baseline.channels.get(channel.path) if baseline is not None else None
     if channel_before is None:

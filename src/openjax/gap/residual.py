@@ -1,5 +1,5 @@
-"""What the chosen effects leave: whether it is more than sensors, air and errors of
-form leave.
+"""A test of what the chosen effects leave unexplained: is it more than sensors, air and errors of
+form leave?
 
 Things that should agree are held against each other: measured motion and replay,
 attitude and gyroscope, path and accelerometer, position and velocity. How much is left
@@ -72,7 +72,7 @@ class Check:
 
     @property
     def rejects(self) -> bool:
-        """Whether what is left is more than noise."""
+        """True if more than noise is left."""
         return self.p_value <= self.level
 
     @property
@@ -84,7 +84,7 @@ class Check:
         return 1.0 / (1.0 + (self.p_value / self.level) ** DECISION.unknown_odds)
 
     def in_words(self) -> str:
-        """What is left, in one sentence."""
+        """A sentence on what is left."""
         return (
             f"What is left isn't noise (p = {self.p_value:.2g}): {self.finding}."
             if self.rejects
@@ -93,8 +93,8 @@ class Check:
 
 
 def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
-    """Whether a fit leaves no more than what cases without an unknown cause leave;
-    `nothing`: the fit of no effect.
+    """Check that a fit leaves no more than cases without an unknown cause do; `nothing` is the fit
+    of no effect.
     """
     changes = _changes(evidence, residuals_of(fit))
     measures, axes = _spreads(changes)
@@ -246,9 +246,8 @@ def _shift(pose) -> float:
 
 
 def _larger(measures: dict[str, float], reference: dict[str, float], finding: str) -> list[str]:
-    """What of forces and torques is left more than in the reference: what stands out
-    most, or what does beside sensors that disagree, which by themselves are no rival of
-    a force or torque.
+    """The force or torque of which more is left than in the reference: the one that stands out
+    most, also beside sensors that disagree, which by themselves are no rival of a force or torque.
     """
     days = dict(zip(HORIZONS, difference_of_days(), strict=True))
     return [
@@ -307,9 +306,8 @@ def calibration_values(with_reference: bool) -> np.ndarray:
 def standing_out(
     measures: dict[str, float], reference: dict[str, float] | None = None
 ) -> tuple[float, str]:
-    """How far one of a case's measures stands out at most of what is expected, in
-    standard deviations, and which; logs without anything to hold against each other
-    stand out nowhere.
+    """The largest distance of one of a case's measures from what is expected, in standard
+    deviations, and that measure. Logs without anything to compare stand out nowhere.
 
     What makes a sensor noisy raises all that it has a part in; so each logarithm is
     expected given the others, as of a normal distribution. What the `reference` leaves

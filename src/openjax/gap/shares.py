@@ -1,5 +1,5 @@
-"""How the gap splits: what each accepted effect, the sensors and the unexplained rest
-take of it, on stretches that no parameter was fitted to.
+"""The split of the gap among accepted effects, sensors and the unexplained rest, on stretches that
+no parameter was fitted to.
 
 The gap is the rms over channels of each channel's prediction error over its floor:
 velocity over 0.25 s as path and accelerometer say it, body rates over 0.05 s, the pose
@@ -50,7 +50,7 @@ class Share:
 
 @dataclass(frozen=True)
 class Gap:
-    """How far the simulator is off, in units of the floor."""
+    """The simulator's error, in units of the floor."""
 
     metric: str
     before: float
@@ -71,7 +71,7 @@ class Gap:
         return float(norm.cdf((DECISION.least_gap - self.reduction) / deviation))
 
     def in_words(self) -> str:
-        """How far the gap shrinks, and a warning where it doesn't."""
+        """A sentence on how far the gap shrinks, and a warning if it doesn't."""
         low, high = (100 * v for v in self.interval90)
         text = (
             f"Gap on held-out flights: {self.before:.2f} before, {self.after:.2f} after, "

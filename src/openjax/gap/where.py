@@ -1,5 +1,5 @@
-"""Where the gap lies: channel by regime, in units of the noise floor, before and after
-the named effects.
+"""The places of the gap, channel by regime, in units of the noise floor, before and after the named
+effects.
 """
 
 from dataclasses import dataclass, replace

@@ -58,7 +58,7 @@ class Trials(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlanSearch:
-    """Which plans are tried, and what they are worth."""
+    """A search over plans: those that are tried, and their worth."""
 
     settings: PlanSettings
     game: PursuitSettings

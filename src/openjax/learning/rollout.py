@@ -42,7 +42,7 @@ def newest_frame(observation: Observation) -> Observation:
 
 @dataclass(frozen=True)
 class Players:
-    """Who flies in a rollout."""
+    """The players of a rollout."""
 
     environment: Pursuit
     policy: Policy

@@ -1,5 +1,5 @@
-"""When worlds start: in groups, one of which ends its episodes after each rollout, and
-some anew in between.
+"""The schedule by which worlds start: in groups, one of which ends its episodes after each rollout,
+while some worlds restart in between.
 """
 
 from dataclasses import dataclass
@@ -63,7 +63,7 @@ class Schedule:
         return jax.tree.map(take, worlds)
 
     def restarts(self, number: int) -> int:
-        """How many of `number` worlds start anew in a training step, beside those whose
+        """The number of `number` worlds that restart in a training step, beside those whose
         episodes ended.
         """
         if not self.restart_every:

@@ -262,9 +262,7 @@ class AnalyticSettings:
 
 @dataclass(frozen=True)
 class WorstPlansSettings:
-    """What the last stage learns from evaders' plans; see
-    `openjax.learning.gradient.worst_plans`.
-    """
+    """The last stage's lessons from evaders' plans; see `openjax.learning.gradient.worst_plans`."""
 
     worlds: Annotated[int, Interval("[0, 65536]")] = 0
     """Worlds in which an evader plans; 0: the last stage has none of them."""
@@ -321,7 +319,7 @@ class WorstPlansSettings:
 
 @dataclass(frozen=True)
 class PlanSettings:
-    """Which plans an evader tries; see `openjax.learning.plan_search`."""
+    """The plans that an evader tries; see `openjax.learning.plan_search`."""
 
     plans: Annotated[int, Interval("[3, 10000]")] = 48
     """That are tried each time."""
@@ -448,7 +446,7 @@ class TrainSettings:
                 raise UserError(text)
 
     def _demands(self):
-        """What settings ask of each other: whether it holds, and what to say if not."""
+        """Conditions between settings: if each holds, and the message if it doesn't."""
         yield from self._demands_of_worlds()
         yield from self._demands_of_teams()
         yield from self._demands_of_evaders()
@@ -590,7 +588,7 @@ class TrainSettings:
 
     @property
     def schedule(self) -> "Schedule":
-        """Which worlds start when."""
+        """The schedule by which worlds start."""
         from openjax.learning.schedule import Schedule
 
         # counted in rollouts; not at the age at which the episode ends anyhow

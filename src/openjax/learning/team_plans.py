@@ -1,5 +1,5 @@
-"""What a team could do in the next second or two: many plans of the pursuers against
-many of the evader, flown by points.
+"""Plans of a team for the next second or two: many plans of the pursuers against many of the
+evader, flown by points.
 
 A policy that learns by small changes of what it does waits where it could close in:
 none of three who stand round an evader gains by going first. A search over plans of the
@@ -79,7 +79,7 @@ Places = Float[Array, "steps drones 3"]
 
 @struct.dataclass
 class TeamPlan:
-    """Where N pursuers go until they turn to the evader itself."""
+    """The way of N pursuers until they turn to the evader itself."""
 
     place: jax.Array  # (..., N, 3) m, beside the evader or of the world
     is_fixed: jax.Array  # (..., N) bool, the place is one of the world
@@ -278,8 +278,8 @@ class TeamPlans:
         return best, -worth
 
     def way(self, state: PursuitState, paths: ShortestPaths, plan: TeamPlan, velocity) -> Places:
-        """Where the pursuers of one world are after each step of a plan against the
-        evader's (steps, 3) m/s.
+        """The positions of one world's pursuers after each step of a plan against the evader's
+        (steps, 3) m/s.
         """
         return self.fly(state.task, paths, self.start(state), plan, velocity)[1]
 

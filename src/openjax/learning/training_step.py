@@ -277,8 +277,8 @@ class _Step:
         return carry.replace(observation=observation, state=state), experience, metrics
 
     def _evaders(self, carry):
-        """How evaders that learn fly, (worlds, noise) -> desired velocities, samples;
-        None where none does.
+        """The function by which learning evaders fly, (worlds, noise) -> desired velocities,
+        samples; None if none learns.
         """
         for name, learner in self.parts.learners.items():
             if hasattr(learner, "act"):

@@ -52,8 +52,8 @@ def in_larger_game(
 
 
 def _own_parts(game: PursuitSettings, predictor: PredictorSettings) -> dict[str, int]:
-    """What a pursuer's own part of the observation consists of, name -> size, in the
-    order of `Observation.self_state`, and the predicted positions behind it.
+    """The parts of a pursuer's own observation, name -> size, in the order of
+    `Observation.self_state`, and the predicted positions behind it.
     """
     parts = {
         "axes": 16,

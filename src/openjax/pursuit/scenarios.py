@@ -137,9 +137,7 @@ def find_scenario(name_or_path: str, settings: PursuitSettings) -> Scenario:
 
 
 def _wrong_counts(layout: Scenario) -> list[str]:
-    """How many pursuers, pillars and characters of a name there are, where that can't
-    be.
-    """
+    """Say how many pursuers, pillars and characters of a name there are, if that can't be."""
     faults = []
     if not 1 <= len(layout.pursuers) <= 8:
         faults.append(f"has {len(layout.pursuers)} pursuers; 1 to 8 are possible")

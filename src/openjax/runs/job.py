@@ -28,8 +28,8 @@ from openjax.store.policy_files import fill
 
 @dataclasses.dataclass(frozen=True)
 class OwnParts:
-    """What was handed in from Python; see `openjax.learning.build`. A resumed run takes the
-    same parts again.
+    """The parts that were passed in from Python; see `openjax.learning.build`. A resumed run takes
+    the same parts again.
     """
 
     environment: Pursuit | None = None

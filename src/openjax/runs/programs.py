@@ -192,8 +192,8 @@ def kept_programs(job: TrainingJob) -> Callable | None:
 
 
 def _made_from(job):
-    """What the run's programs depend on, beside the package's sources; the seed comes in as
-    a key.
+    """Everything that the run's programs depend on beside the package's sources; the seed comes in
+    as a key.
     """
     game = job.parts.environment
     settings = dataclasses.replace(job.settings, seed=0)

@@ -177,7 +177,7 @@ def _plan(run, state):
 
 
 def _metrics(run, state):
-    """What writes metrics: afresh, or on from where a checkpoint was."""
+    """The writer of metrics: a fresh one, or one that continues from a checkpoint."""
     continuation = None
     if state.is_restored:
         steps = state.update * run.job.settings.steps_per_update

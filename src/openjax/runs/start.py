@@ -206,7 +206,7 @@ def _complete(command, environment, stored_facts):
 
 
 def _facts(command, arguments, own_parts):
-    """What is kept beside the settings, so that a resumed run goes on with it."""
+    """Facts that are kept beside the settings, so that a resumed run goes on with them."""
     return {
         **({"own_parts": own_parts.names} if own_parts.names else {}),
         "command": " ".join([PROGRAM, *arguments]),
@@ -252,8 +252,8 @@ def other_compiler(facts: dict) -> str | None:
 
 
 def _files(command, old_run):
-    """What the run flies with by its name in a run's directory: vehicle, effects,
-    evader; None where there is none.
+    """Files that the run flies with, by their names in its directory: vehicle, effects, evader;
+    None if there is none.
     """
     options = {
         "vehicle.toml": command.vehicle,
@@ -280,8 +280,8 @@ def _check_parts(parts, files, facts):
 
 
 def _free_directory(command, processes):
-    """Where a new run is written, the same for all processes. Raises UserError where it
-    can't be.
+    """The directory of a new run, the same for all processes. Raises UserError if it can't be
+    written.
     """
     name = f"{time.strftime('%Y%m%d-%H%M%S')}-{command.preset or default_preset()}"
     out = Path(processes.of_first(str(command.out or Path("runs") / name)))
@@ -290,7 +290,7 @@ def _free_directory(command, processes):
 
 
 def _layout_episodes(environment):
-    """How often each layout is flown where nobody says."""
+    """The default number of episodes of each layout."""
     settings = environment.settings
     differ = settings.start_attitude == "drawn" or settings.vehicles or environment.effects
     if not differ:  # one episode says all
@@ -355,8 +355,8 @@ def check_resumed(command: TrainCommand, stored_settings: TrainSettings) -> None
 
 
 def _devices(text, settings, saved_settings):
-    """How many; where nobody says, as many as the run had (`saved_settings`, None for a
-    new one), or as many cores as the worlds can be shared out to.
+    """The number of devices; by default as many as the run had (`saved_settings`, None for a new
+    one), or as many cores as the worlds divide among.
     """
     available = len(jax.devices())
     if text is None and jax.default_backend() == "cpu" and jax.process_count() == 1:

@@ -19,8 +19,8 @@ NAMED = 3
 
 
 def opening_words(settings: TrainSettings) -> str:
-    """Which preset this is, or comes nearest to, and what that is: nobody should take
-    another game for the paper's.
+    """Name and describe the preset that this is, or the nearest one: nobody should take another
+    game for the paper's.
     """
     changes = {
         name: [leaf for leaf in different_settings(settings, make()) if leaf != "seed"]
@@ -101,7 +101,7 @@ def first_flights_words(summary: dict) -> str:
 
 
 def _pillars(game):
-    """How many, as "4 to 5" or "5"."""
+    """The number of pillars, as "4 to 5" or "5"."""
     return " to ".join(map(str, sorted({game.min_pillars, game.max_pillars})))
 
 

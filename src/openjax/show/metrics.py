@@ -13,7 +13,9 @@ METRICS_FILE = "metrics.jsonl"
 
 
 class Continuation(NamedTuple):
-    """Where a run goes on; records of later updates are removed, as they come again."""
+    """The point from which a run continues. Records of later updates are removed, as they come
+    again.
+    """
 
     update: int
     steps: int = 0

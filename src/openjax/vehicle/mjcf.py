@@ -107,8 +107,8 @@ def read_mjcf(path: str) -> dict[str, np.ndarray]:
 
 
 def _rotors(model, path, body) -> tuple[np.ndarray, np.ndarray]:
-    """Where the rotors are (4, 3) m, and their torque about z per thrust (4,) m, signed
-    by their spin. Raises UserError for rotors that don't push up from the four corners.
+    """The rotors' positions (4, 3) m, and their torque about z per thrust (4,) m, signed by their
+    spin. Raises UserError for rotors that don't push up from the four corners.
     """
     actuators = [_find(model, path, "actuator", name) for name in ROTORS]
     sites = [_find(model, path, "site", name) for name in ROTORS]

@@ -1,5 +1,5 @@
-"""What a Crazyflie's firmware answers over CRTP: parameters, log blocks, set-points,
-arming, external pose.
+"""A Crazyflie's firmware as it answers over CRTP: parameters, log blocks, set-points, arming,
+external pose.
 
 One vehicle, without sockets or clock: packets in, packets out. Set-points of body rates
 or angles with thrust are flown; position set-points, trajectories and memories are not
@@ -102,9 +102,7 @@ class VirtualFirmware:
         return sum(int(bit) for bit, is_so in holds.items() if is_so)
 
     def set_point(self, time: float) -> SetPoint:
-        """What the stabiliser is asked for at `time`, watchdogs and supervision
-        included.
-        """
+        """The set-point that the stabiliser gets at `time`, watchdogs and supervision included."""
         if self._watchdog_time is not None and time - self._watchdog_time > WATCHDOG:
             self.emergency = True
         if self._set_point_time is None or not self.armed or self.crashed or self.emergency:

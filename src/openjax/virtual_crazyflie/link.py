@@ -18,8 +18,8 @@ from openjax.virtual_crazyflie.firmware import STEP
 
 @dataclass(frozen=True)
 class LinkFaults:
-    """What the link does to the two streams of a flight. Requests and their answers
-    pass: a radio sends them again.
+    """Faults of the link in the two streams of a flight. Requests and their answers pass: a radio
+    sends them again.
     """
 
     latency_ms: Annotated[float, Interval("[0, 1000]")] = 0.0
@@ -95,7 +95,7 @@ class VirtualLink:
             heapq.heappush(self._incoming, (due, self._count, raw, peer))
 
     def next_due(self) -> float:
-        """When the next packet in either direction is due; infinite if none waits."""
+        """The time at which the next packet in either direction is due; infinite if none waits."""
         waiting = [queue[0][0] for queue in (self._incoming, self._outgoing) if queue]
         return min(waiting, default=float("inf"))
 

@@ -111,8 +111,8 @@ class VirtualVehicles:
         self.report = self.advance(np.zeros((self.number, 5), np.float32), 0)
 
     def advance(self, set_points: np.ndarray, steps: int) -> SensorReadings:
-        """What is sensed after `steps` steps under constant set-points (N, 5) float32,
-        see `SetPoint`; after none, what the motors are asked for by new ones.
+        """The sensors' readings after `steps` steps under constant set-points (N, 5) float32, see
+        `SetPoint`; after none, the motors' commands under new ones.
         """
         self._state, report = self._advance(self._state, set_points, np.int32(steps))
         self.report = SensorReadings._make(np.asarray(leaf, np.float64) for leaf in report)

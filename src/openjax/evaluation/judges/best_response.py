@@ -74,7 +74,7 @@ class Evaders:
 
     @property
     def networks(self) -> tuple[Any, Any, jax.Array]:
-        """What learns."""
+        """The networks that learn."""
         return self.actor, self.critic, self.log_std
 
 
@@ -104,8 +104,8 @@ class Decisions:
 
 @struct.dataclass
 class Chase:
-    """What explains an escape, summed over the moments of an episode in which the evader
-    is free.
+    """Numbers that explain an escape, summed over the moments of an episode in which the evader is
+    free.
     """
 
     moments: jax.Array  # () how many

@@ -99,7 +99,7 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class ColumnMapping:
-    """Which column of a log is what."""
+    """The meaning of each column of a log."""
 
     columns: dict[str, Source] = field(default_factory=dict)
     """Sources of the log format's columns."""

@@ -1,5 +1,4 @@
-"""Which importers there are: each says which files are its own, and reads them as a
-`LogTable`.
+"""The list of importers. Each recognises its own files and reads them as a `LogTable`.
 
 The shipped ones are in a list like any other; a program of yours adds one by
 `register`.

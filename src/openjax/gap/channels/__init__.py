@@ -1,4 +1,4 @@
-"""What a log says by ways of its own: pose, radio, rate loop and motion, each a channel
+"""The independent sources of evidence in a log: pose, radio, rate loop and motion, each a channel
 with the same few methods.
 """
 

@@ -1,4 +1,4 @@
-"""What commands caused of the motors, and what feedback made of them.
+"""The part of the motors that commands caused, apart from the part that feedback added.
 
 In closed loop the motors answer gusts, noise of the gyroscope and whatever pushes the
 body, so a regression on the motors as logged is biased: towards weak motors where they
@@ -82,8 +82,8 @@ def read_feedback(tracks, vehicles, by_commands) -> list[Feedback]:
 
 
 def _feedback(rest: np.ndarray, track: Track, vehicle) -> Feedback:
-    """What outputs (T, 3) that no command explains, and the motors themselves, do to
-    one track.
+    """The effect on one track of outputs (T, 3) that no command explains, and of the motors
+    themselves.
     """
     quick_part = rest - smooth(rest, TRIM, track.dt)
     slow_motors = smooth(track.motor, TRIM, track.dt)

@@ -42,7 +42,7 @@ SLOW_ROWS = 1.2
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """How the rows of a case are read."""
+    """A way of reading the rows of a case."""
 
     library: Library
     tracks: list[Track]
@@ -89,8 +89,8 @@ class Reading:
 
     @property
     def lacks_thrust_map(self) -> bool:
-        """Whether it isn't known what thrust a motor command makes: of duty cycles
-        without a reference, or without the voltage that changes it.
+        """True if the thrust of a motor command is unknown: for duty cycles without a reference, or
+        without the voltage that changes it.
         """
         volts = all(t.voltage is not None for t in self.tracks)
         return self.pwm and (self.baseline is None or not volts) and not self.reference
@@ -112,7 +112,7 @@ class Reading:
 
 
 def motor_rows(case: Case) -> str:
-    """What a row's motor commands are, of `clocks.ROWS`. Raises UserError for anything
+    """The meaning of a row's motor commands, one of `clocks.ROWS`. Raises UserError for anything
     else.
     """
     rows = case.vehicle_file.log.get("motor_rows", ROWS[0])
@@ -127,7 +127,7 @@ def motor_rows(case: Case) -> str:
 def make_reading(
     case: Case, library: Library, tracks, vehicles, arrivals, sensors: Kinematics
 ) -> Reading:
-    """How the rows of a case are to be read."""
+    """Choose how the rows of a case are read."""
     shortest = min(f.row_period for f in case.flights)
     slow = shortest > 0.8 * GRID_PERIOD  # faster logs are averaged
     seldom = max(t.dt for t in tracks) > SLOW_ROWS * GRID_PERIOD
@@ -154,7 +154,7 @@ def make_reading(
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What the flights say of the effects between motors and motion."""
+    """The flights' evidence on the effects between motors and motion."""
 
     replay: Replay
     library: Library
@@ -246,14 +246,13 @@ def _beside_others(motion: Motion) -> Motion:
 
 
 def _is_lag(effect: str) -> bool:
-    """Whether an effect is a time by which something comes later."""
+    """True if an effect is a time by which something comes later."""
     return any(EFFECTS[effect].parameters[p.name].unit == "s" for p in CARDS[effect].fitted)
 
 
 def _is_hidden(card, reading: Reading) -> bool:
-    """Whether an effect can't be told from these logs, however large it is: its channel
-    is missing, or it looks like a nuisance, what motors do unseen or the map from duty
-    cycles to thrust.
+    """True if an effect can't be told from these logs, however large it is: its channel is missing,
+    or it looks like a nuisance, what motors do unseen or the map from duty cycles to thrust.
     """
     if card.needs and any(getattr(t, card.needs) is None for t in reading.tracks):
         return True

@@ -55,7 +55,7 @@ class Pose(Channel):
 
     @property
     def late(self) -> bool:
-        """Whether the pose clearly is late, be it by little."""
+        """True if the pose is clearly late, even if only by little."""
         return self.fit.value > DECISION.standard_errors * self.fit.error and self.fit.nats > 0.0
 
     def acting(self) -> dict[str, float]:
@@ -87,8 +87,8 @@ def read_pose(tracks: list[Track], library) -> Pose | None:
 
 
 def read_delay(tracks: list[Track]) -> Delay:
-    """How late the attitude is against the gyroscope; a clock offset of a few ms is a
-    nuisance. The delay is found by Gauss-Newton steps: the body turns on meanwhile.
+    """The delay of the attitude against the gyroscope. A clock offset of a few ms is a nuisance.
+    The delay is found by Gauss-Newton steps: the body turns on meanwhile.
     """
     delay = 0.0
     for _ in range(STEPS):

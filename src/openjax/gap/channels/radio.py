@@ -71,7 +71,7 @@ class Link:
 
 @dataclass(frozen=True, eq=False)
 class Radio(Channel):
-    """What the commands' way to the vehicle does to them."""
+    """Losses and delays of commands on their way to the vehicle."""
 
     delay: float  # s
     links: dict[frozenset, Link]
@@ -95,9 +95,7 @@ class Radio(Channel):
 
     @property
     def readable(self) -> bool:
-        """Whether the motors' stream follows the commands closely enough to tell single
-        packets.
-        """
+        """True if the motors' stream follows the commands closely enough to tell single packets."""
         return self.links[frozenset({DELAY, LOSS})].misfit < READABLE
 
     @property

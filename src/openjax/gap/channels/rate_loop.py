@@ -52,7 +52,7 @@ GAINS = ("p", "i", "d")
 
 @dataclass(frozen=True, eq=False)
 class RateLoop(Channel):
-    """What the rate controllers on board did."""
+    """The behaviour of the rate controllers on board."""
 
     change: np.ndarray
     """(6,) of p, i, d as shares: roll and pitch first, then yaw."""
@@ -260,7 +260,7 @@ def _series(
     """
 
     def of_row(ticks):
-        """What a row of the log shows (T, 3) of what the ticks did (T, TICKS, 3)."""
+        """The part of the ticks (T, TICKS, 3) that a row of the log shows (T, 3)."""
         if reading.at_once:
             return ticks[:, 0]
         if track.fast_thrust is None:

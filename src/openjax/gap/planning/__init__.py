@@ -1,1 +1,1 @@
-"""Which flight to fly next: the one that tells the likeliest causes apart."""
+"""The choice of the next flight: the one that tells the likeliest causes apart."""

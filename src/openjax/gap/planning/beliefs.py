@@ -1,4 +1,4 @@
-"""What is believed after a diagnosis, from its `report.json`."""
+"""Beliefs after a diagnosis, from its `report.json`."""
 
 import json
 from pathlib import Path
@@ -73,8 +73,8 @@ def beliefs_of(report: dict) -> list[Belief]:
 
 
 def acts_in_physics(effect: str) -> bool:
-    """Whether an effect acts in the physics, and needs no second vehicle, so that a
-    segment may show it.
+    """True if an effect acts in the physics and needs no second vehicle, so that a segment may show
+    it.
     """
     card = CARDS.get(effect)
     return card is not None and card.path == "physics" and not card.of_others
@@ -94,8 +94,8 @@ def _theta(effects, parameters: dict) -> np.ndarray:
 
 
 def advice_for(report: dict, vehicle_file: VehicleFile) -> tuple[str, Advice]:
-    """What to fly after a report (as `report.json`), in words and by segments. Raises
-    UserError where nothing is left to tell apart.
+    """Advice on the flight after a report (as `report.json`), in words and by segments. Raises
+    UserError if nothing is left to tell apart.
     """
     beliefs = beliefs_of(report)
     if len(beliefs) < 2:
@@ -110,13 +110,13 @@ def advice_for(report: dict, vehicle_file: VehicleFile) -> tuple[str, Advice]:
 
 
 def is_open(beliefs: list[Belief]) -> bool:
-    """Whether enough is left open for a flight."""
+    """True if enough is left open for a flight."""
     return 1.0 - sum(b.probability**2 for b in beliefs) >= OPEN
 
 
 def next_flight(report: dict, vehicle_file: VehicleFile) -> str:
-    """What to fly after a report, by the same rule as `openjax plan`; empty where too
-    little is left open.
+    """The flight to fly after a report, by the same rule as `openjax plan`; empty if too little is
+    left open.
     """
     beliefs = beliefs_of(report)
     if not is_open(beliefs):
@@ -125,7 +125,7 @@ def next_flight(report: dict, vehicle_file: VehicleFile) -> str:
 
 
 def sentence(advice: Advice, report: dict) -> str:
-    """What to do next, and why."""
+    """The next step, and the reason for it."""
     best = advice.promises[0]
     hopeless = [pair for pair, nats in advice.nats.items() if nats < DETECTABLE]
     weigh = [pair for pair in hopeless if set(pair) <= SCALE_ONLY]
@@ -145,7 +145,7 @@ def sentence(advice: Advice, report: dict) -> str:
 
 
 def _to_mend(report: dict) -> list[str]:
-    """What to log otherwise, before any flight is worth it."""
+    """Changes of the log without which no flight is worth it."""
     remarks = report.get("identification", {}).get("remarks", ())
     issues = [entry["issue"] for entry in report.get("quality", ())]
     reasons = {

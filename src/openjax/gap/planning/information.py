@@ -1,4 +1,4 @@
-"""What each segment of flight is expected to tell.
+"""The information that each segment of flight is expected to give.
 
 A segment is flown by the nominal simulator. Of two causes i and j it then shows d_ij =
 1/2 |f_i - f_j|^2 nats, in units of the noise, less what nuisances and the parameters of
@@ -47,7 +47,7 @@ class Belief:
 
 @dataclass(frozen=True)
 class Promise:
-    """What a segment promises."""
+    """The information that a segment promises."""
 
     segment: str
     value: float
@@ -60,7 +60,7 @@ class Promise:
 
 @dataclass(frozen=True, eq=False)
 class Advice:
-    """What to fly next."""
+    """Advice on the next flight."""
 
     promises: tuple[Promise, ...]
     """Best first."""

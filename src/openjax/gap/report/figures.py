@@ -147,7 +147,7 @@ def _courses_of_motion(report: Report) -> Iterator[Course]:
 
 
 def _axis_name(axis: int) -> tuple[str, str]:
-    """What an axis of the residuals is, and its unit."""
+    """The name and unit of an axis of the residuals."""
     if axis >= 3:
         return f"velocity {'xyz'[axis - 3]}", "m/s"
     return f"{('roll', 'pitch', 'yaw')[axis]} rate", "rad/s"
@@ -188,7 +188,7 @@ def _lines(report: Report, nominal, with_effects) -> Sequence[tuple]:
 
 
 def _coordinate(report: Report):
-    """What the nominal simulator misses, against the variable that the first named
+    """The acceleration that the nominal simulator misses, against the variable that the first named
     effect follows.
     """
     evidence = report.plots["evidence"]

@@ -44,7 +44,7 @@ class Difference:
 
 
 def member_of(name: str, answer: Report | Change) -> Member:
-    """What is kept of a vehicle's answer."""
+    """The part of a vehicle's answer that the page compares."""
     if isinstance(answer, Change):
         return Member(name, answer.title, answer.sentence(), None, {})
     gap = (answer.gap.before, answer.gap.after)
@@ -52,8 +52,8 @@ def member_of(name: str, answer: Report | Change) -> Member:
 
 
 def differences(members: Sequence[Member]) -> list[Difference]:
-    """Where a vehicle's number is further from the median than errors and what forms
-    may be wrong by; of two vehicles, from the other's.
+    """Numbers of a vehicle that are further from the median than their errors and the errors of
+    form. Of two vehicles, each is compared with the other.
     """
     out = []
     for number in dict.fromkeys(n for member in members for n in member.numbers):
@@ -69,7 +69,7 @@ def differences(members: Sequence[Member]) -> list[Difference]:
 
 
 def _differs(quantity: Quantity, middle: float, error: float) -> bool:
-    """Whether a number isn't another one, which has an error."""
+    """True if a number differs from another one that has an error."""
     apart = abs(quantity.value - middle)
     errors = DECISION.standard_errors * float(np.hypot(_error(quantity), error))
     return apart > max(errors, DECISION.form_error * max(abs(quantity.value), abs(middle)))

@@ -40,7 +40,7 @@ def page_of(report: Report, folder: Path | None = None) -> str:
 
 
 def _trims(report: Report) -> dict | None:
-    """What the page shows of trims beside the reference; None without."""
+    """The trims that the page shows beside the reference's; None without any."""
     if report.trims is None:
         return None
     answers = report.change_by_trims is not None

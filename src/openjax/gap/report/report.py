@@ -1,4 +1,4 @@
-"""What was found in one case, as plain data and as text."""
+"""The findings of one case, as plain data and as text."""
 
 from collections.abc import Collection
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
@@ -52,21 +52,21 @@ class Estimate:
 
     @property
     def is_size(self) -> bool:
-        """Whether the interval tells the order of magnitude."""
+        """True if the interval tells the order of magnitude."""
         near, far = sorted(map(abs, self.interval90))
         one_sign = self.interval90[0] * self.interval90[1] > 0.0
         return not one_sign or far <= WIDEST * near
 
     @property
     def unusual(self) -> bool:
-        """Whether all of the interval lies outside of the prior range."""
+        """True if all of the interval lies outside the prior range."""
         low, high = self.interval90
         return high < self.usual[0] or low > self.usual[1]
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What the flights of one case say."""
+    """The findings from the flights of one case."""
 
     case: str
     verdict: str
@@ -123,9 +123,9 @@ class Report:
 
     @property
     def change_by_trims(self) -> Change | None:
-        """What trims and gains say changed beyond what days differ by, where that is
-        none of the names: a cause that moves trims, or one that these flights could not
-        have shown the diagnosis. Else None.
+        """The change that trims and gains show beyond the spread of days, if no name explains it: a
+        cause that moves trims, or one that these flights could not have shown the diagnosis.
+        Otherwise None.
         """
         trims = self.trims
         if trims is None or not trims.changed or self._explains(trims):
@@ -134,7 +134,7 @@ class Report:
         return trims if decides else None
 
     def _explains(self, trims: Change) -> bool:
-        """Whether a named effect is what trims say changed: by its name, by one that
+        """True if a named effect explains the change that trims show: by its name, by one that
         would do as well, or as both change the thrust.
         """
         names = {*self.named, *(o for others in self.equivalent.values() for o in others)}
@@ -172,7 +172,7 @@ class Report:
 
     @property
     def agrees(self) -> bool:
-        """Whether nothing differs, by any measure."""
+        """True if nothing differs by any measure."""
         differs = self.departures or self.change_by_trims is not None
         return self.verdict == "none" and not differs
 
@@ -196,7 +196,7 @@ class Report:
 
     @property
     def notes(self) -> list[str]:
-        """What was found in the logs that were used."""
+        """Remarks on the logs that were used."""
         return [f"{q['flight']}: {q['issue']}" for q in self.quality if not q.get("left_out")]
 
     def prediction(self) -> dict:
@@ -256,7 +256,8 @@ class Report:
         return " ".join(parts)
 
     def _named_in_words(self) -> str:
-        """What share of the gap the named effects cause, and what they are good for."""
+        """The share of the gap that the named effects cause, and how much they improve predictions.
+        """
         what = "What changed since the reference" if self.reference else "What the simulator misses"
         values = [self.shares.effects[effect].value for effect in self.named]
         parts = " and ".join(
@@ -286,7 +287,7 @@ class Report:
         return f"{text}."
 
     def measured_in_words(self) -> list[str]:
-        """What the vehicle does, beside the simulator, without any cause."""
+        """The vehicle's measured behaviour beside the simulator's, without any cause."""
         does = self.identification
         if does is None or not does.trustworthy:
             return []
@@ -331,7 +332,7 @@ class Report:
         return [line for line in [*lines, *self._open_in_words()] if line]
 
     def _open_in_words(self) -> list[str]:
-        """What is left open, and what would tell it."""
+        """Open questions, and the flights that would answer them."""
         lines = []
         if self.runner_up:
             lines.append(f"Next most probable: {self.runner_up}.")
@@ -360,7 +361,7 @@ class Report:
 
 
 def _scale_motion(effects: Collection[str]) -> bool:
-    """Whether one of the effects changes all accelerations in proportion."""
+    """True if one of the effects changes all accelerations in proportion."""
     return any(CARDS[e].scales_motion for e in effects if e in CARDS)
 
 

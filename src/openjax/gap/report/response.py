@@ -1,5 +1,5 @@
-"""What was measured of the vehicle, before any cause is asked for: its numbers and its
-response to its motors, beside the simulator's.
+"""The measured vehicle, before any cause is considered: its numbers and its response to its motors,
+beside the simulator's.
 """
 
 from collections.abc import Collection
@@ -21,8 +21,8 @@ PANEL = (2.9, 4.0)  # inches, of one axis
 
 
 def response_of(report: Report) -> dict | None:
-    """What `response.html.jinja` shows: sentences, remarks, rows of numbers and the
-    pictures (SVG) of every axis; None where nothing was measured.
+    """The contents of `response.html.jinja`: sentences, remarks, rows of numbers and the pictures
+    (SVG) of every axis; None if nothing was measured.
     """
     does = report.identification
     if does is None:
@@ -60,7 +60,7 @@ def _limits() -> str:
 
 
 def meaning_of(name: str, quantity: Quantity, report: Report) -> str:
-    """Whether a number differs from the simulator's, and whether that matters."""
+    """Words that say if a number differs from the simulator's, and if that matters."""
     if not quantity.differs:
         return "as in the simulator"
     if quantity.effect in report.named or moves(name, report.named):
@@ -75,8 +75,8 @@ def meaning_of(name: str, quantity: Quantity, report: Report) -> str:
 
 
 def moves(name: str, effects: Collection[str]) -> bool:
-    """Whether one of the `effects` moves a number that belongs to another one: what
-    weakens the thrust weakens all torques.
+    """True if one of the `effects` moves a number that belongs to another one: a weaker thrust
+    means weaker torques.
     """
     cards = [CARDS[e] for e in effects if e in CARDS]
     if name.endswith("_trim"):

@@ -1,4 +1,4 @@
-"""What every report must keep, whatever flew: its parts don't contradict each other."""
+"""Rules that every report must keep, whatever flew: its parts don't contradict each other."""
 
 import re
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ def broken_rules(report: Report) -> list[str]:
 
 
 def _testable(report: Report) -> Iterator[str]:
-    """What is named is testable."""
+    """A named effect is testable."""
     for effect in report.named:
         if effect in report.not_testable:
             yield f"{effect} is named and not testable"
@@ -41,7 +41,7 @@ def _told(report: Report) -> set[str]:
 
 
 def _shares(report: Report) -> Iterator[str]:
-    """What is named has a share of the gap, unless the torques told it."""
+    """A named effect has a share of the gap, unless the torques told it."""
     for effect in report.named:
         share = report.shares.effects[effect]
         low, high = share.interval90
@@ -52,7 +52,7 @@ def _shares(report: Report) -> Iterator[str]:
 
 
 def _predictions(report: Report) -> Iterator[str]:
-    """What is named makes held-out predictions no worse."""
+    """Named effects make held-out predictions no worse."""
     if set(report.named) - _told(report) and report.gap.reduction < 0.0:
         yield f"{', '.join(report.named)}: held-out predictions get worse"
 
@@ -109,7 +109,7 @@ def _one_verdict(report: Report) -> Iterator[str]:
 
 
 def _measurements(report: Report) -> Iterator[str]:
-    """What is said of the response is what was measured."""
+    """The words on the response are those of the measurement."""
     does = report.identification
     if does is None or not does.trustworthy:
         return

@@ -16,8 +16,8 @@ PANEL = (2.6, 2.2)  # inches
 
 
 def content_of(change: Change, lines: list[str], answers: bool) -> dict:
-    """What `trims.html.jinja` shows of it, and what is said of it in `lines`. With
-    `answers` the probabilities of places are shown, too.
+    """The contents of `trims.html.jinja`, with the sentences `lines`. With `answers` it shows the
+    probabilities of places, too.
     """
     level = np.mean([f.values["hover"][0] for f in change.reference])
     pictures = []
@@ -75,7 +75,7 @@ def draw_trim(axes: Axes, change: Change, name: str, level: float) -> None:
 
 
 def draw_places(axes: Axes, change: Change) -> None:
-    """How probable no change is, and each place of one."""
+    """Draw the probabilities of no change and of each place of one."""
     places = sorted(change.places.items(), key=lambda item: -item[1])[:6]
     names = [
         "all" if len(p) == 4 else "+".join(f"m{i}" for i in p) or "no rotor's" for p, _ in places

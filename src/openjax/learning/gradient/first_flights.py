@@ -70,8 +70,8 @@ class FirstWorlds:
 
 @dataclass(frozen=True)
 class FirstFlights:
-    """How a fresh actor learns to fly. `World`s are observations and states (B, ...), a
-    device's share of them all.
+    """The stage in which a fresh actor learns to fly. `World`s are observations and states (B,
+    ...), a device's share of them all.
     """
 
     settings: FirstFlightsSettings
@@ -118,8 +118,8 @@ class FirstFlights:
         return jax.vmap(environment.reset_to)(reset_keys, tasks)
 
     def loss(self, actor: Any, parameters: PolicyParameters, world, ramp: Scalar):
-        """What is learnt (); worlds after it and its parts. `ramp` () is how far the
-        penalties have risen, 0 to 1.
+        """The loss (), the worlds after it, and its parts. `ramp` () is how far the penalties have
+        risen, 0 to 1.
         """
         settings = self.settings
         is_fast_possible = self.flight.game.speed_limit == "none"

@@ -76,8 +76,7 @@ class LastFlights:
 
     @property
     def moments(self) -> int:
-        """How often a flight is looked at: after each `HORIZON` but the episode's
-        last.
+        """The number of times a flight is looked at: after each `HORIZON` but the episode's last.
         """
         # what is learnt from a moment takes another `HORIZON`, which has to end with
         # the episode
@@ -139,7 +138,7 @@ class LastFlights:
     def loss(
         self, actor: Any, parameters: PolicyParameters, starts, flying
     ) -> tuple[Scalar, dict[str, Scalar]]:
-        """What is learnt (), and its parts. `parameters` are the policy's before."""
+        """The loss () and its parts. `parameters` are the policy's before."""
         settings = self.settings
         weight = functools.partial(team_weight, self.flight.game)
         number = starts[1].step.shape[0]

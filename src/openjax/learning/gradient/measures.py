@@ -1,5 +1,4 @@
-"""What pursuers meet in flight, as smooth numbers: how near a crash is, a breach, the
-evader.
+"""Smooth measures of a flight: how near a crash, a breach or the evader is.
 
 A crash or a capture is a step, which has no gradient. Here each goes from none to whole
 over a distance, so that the actor feels it before it comes.
@@ -88,8 +87,8 @@ def nearest_gap(game: PursuitSettings, state: PursuitState) -> Pursuers:
 
 
 def crash_share(gap: Float[Array, "*worlds"], smooth: float = SMOOTH) -> Float[Array, "*worlds"]:
-    """How much of a crash a least gap (m) counts as, from 1 to 0 over `smooth` (m): it
-    has a gradient before a touch.
+    """The share of a crash that a least gap (m) counts as, from 1 to 0 over `smooth` (m). It has a
+    gradient before a touch.
     """
     # half of one at three times the gap that counts as a touch
     return jax.nn.sigmoid((3 * TOUCH - gap) / smooth)
@@ -189,7 +188,7 @@ def end_excess(drones: DroneState) -> Pursuers:
 
 
 class Encounter(NamedTuple):
-    """What the pursuers of B worlds met in some steps, all smooth and (B, N) unless
+    """Measures of what the pursuers of B worlds met in some steps, all smooth and (B, N) unless
     said otherwise.
     """
 
@@ -249,8 +248,8 @@ def mean_step(
 
 @dataclass(frozen=True)
 class SmoothFlight:
-    """How a policy flies while a gradient is taken. `World`s are observations and states
-    (B, ...).
+    """The flight of a policy while a gradient is taken. `World`s are observations and states (B,
+    ...).
     """
 
     environment: Pursuit
@@ -327,9 +326,7 @@ class SmoothFlight:
         return jax.lax.scan(one, (world, nothing), None, length=steps)
 
     def _measure(self, encounter, state, paths, steps):
-        """What pursuers have met so far, with what the step that ended with `state`
-        adds.
-        """
+        """Add what the step that ended with `state` brought to what pursuers have met so far."""
         limit = AnalyticSettings.SPEED_FROM * self.game.max_speed
         radius = capture_radius(self.game, state.task)
         rest = REST * radius

@@ -80,15 +80,15 @@ class Lesson(Protocol):
         """
 
     def begin(self, key: PRNGKeyArray) -> Any:
-        """What is carried from update to update beside the actor, as worlds under
+        """The state that is carried from update to update beside the actor, such as worlds under
         way.
         """
 
     @property
     def programs(self) -> tuple[Callable[[Turn, tuple], Any], ...]:
-        """What an update does, one after the other: each is handed the turn and what
-        those before it returned, and the last one returns what is `Learnt`. They are
-        compiled side by side, as a whole update would take a GPU's compiler minutes.
+        """The programs of an update, in their order: each gets the turn and the results of those
+        before it, and the last one returns what is `Learnt`. They are compiled side by side, as a
+        whole update would take a GPU's compiler minutes.
         """
 
 

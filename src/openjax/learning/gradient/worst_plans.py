@@ -90,7 +90,7 @@ class PlannedWorlds:
 
 
 class Example(NamedTuple):
-    """What the pursuers of B worlds are shown by the search."""
+    """The search's example for the pursuers of B worlds."""
 
     places: jax.Array
     """(B, pieces, N, 3) m, where they should be after each piece of the evader's
@@ -124,7 +124,7 @@ class WorstPlans:
 
     @functools.cached_property
     def flight(self) -> SmoothFlight:
-        """What flies in that game, and measures."""
+        """The flight in that game, with its measures."""
         return dataclasses.replace(self.usual.flight, environment=self.environment)
 
     @property
@@ -142,7 +142,7 @@ class WorstPlans:
 
     @functools.cached_property
     def team(self) -> TeamPlans:
-        """What a team could do."""
+        """The plans that a team could follow."""
         seconds = self.search.settings.steps * self.game.time_step
         return TeamPlans(self.game, self.planning.TEAM_PLANS, seconds)
 
@@ -186,8 +186,7 @@ class WorstPlans:
     def attempts(
         self, actor: Any, parameters: PolicyParameters, world, plan: Plan, key: PRNGKeyArray
     ) -> Trials:
-        """What became of the evaders' plans in worlds (B, ...); `plan` is the rest of
-        the last one.
+        """The outcome of the evaders' plans in worlds (B, ...); `plan` is the rest of the last one.
         """
         fly_on = mean_step(self.environment, self.flight.policy, parameters)
 
@@ -203,9 +202,9 @@ class WorstPlans:
     def show(
         self, trials: Trials, world, team_plan: TeamPlan, plan: Plan, key: PRNGKeyArray
     ) -> tuple[TeamPlan, Example]:
-        """What the teams of worlds (B, ...) should do against evaders that fly `plan`:
-        what is best against the worst of the plans that promised most. `team_plan` is
-        the rest of the last one.
+        """The best actions of the teams of worlds (B, ...) against evaders that fly `plan`: those
+        that do best against the worst of the most promising plans. `team_plan` is the rest of the
+        last one.
         """
         team = self.team
         # found once: pillars stand still, whatever is tried
@@ -245,8 +244,8 @@ class WorstPlans:
         plan: Plan,
         example: Example | None = None,
     ) -> tuple[Scalar, tuple[Any, dict[str, Scalar]]]:
-        """What is learnt () while evaders fly their plans; the worlds after the plans'
-        first piece, and the loss's parts.
+        """The loss () while evaders fly their plans, the worlds after the plans' first piece, and
+        the loss's parts.
         """
         planning = self.planning
         weight = functools.partial(team_weight, self.game)

@@ -65,7 +65,7 @@ class LearningEvaders:
 
     @property
     def networks(self) -> tuple[Any, Any, jax.Array]:
-        """What learns."""
+        """The networks that learn."""
         return self.actor, self.critic, self.log_std
 
 
@@ -82,7 +82,7 @@ class EvaderSamples:
 
 @dataclass(frozen=True, eq=False)
 class EvaderLearner:
-    """How the learned evaders of a game learn (`openjax.learning.learners.Learner`)."""
+    """The learner of a game's learned evaders (`openjax.learning.learners.Learner`)."""
 
     settings: EvaderLearningSettings
     environment: Pursuit
@@ -286,9 +286,7 @@ class EvaderLearner:
         return objective.loss(answer, part)[0]
 
     def _batch(self, evaders, samples, last, axis):
-        """What gradient steps need, minibatch by minibatch: see `_gradient` and
-        `_loss`.
-        """
+        """The data of the gradient steps, minibatch by minibatch: see `_gradient` and `_loss`."""
         settings = self.settings
         advantage, value = self._advantages(evaders, samples, last)
         # a world keeps its evader until the rollout's end

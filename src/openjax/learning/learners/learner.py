@@ -39,8 +39,8 @@ class Experience:
 
 @runtime_checkable
 class Learner(Protocol):
-    """What learns from each rollout: of the policy's parameters some, or something
-    beside them.
+    """A learner updates some of the policy's parameters, or something beside them, from each
+    rollout.
 
     Its state is any tree of arrays, the same on all devices; checkpoints hold it, and a
     resumed run goes on with it. Learners come one after the other, in the order of

@@ -1,4 +1,4 @@
-"""Which evader a world has, and what it remembers."""
+"""A world's evader, and its memory."""
 
 import jax
 from flax import struct

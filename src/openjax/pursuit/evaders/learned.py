@@ -83,9 +83,9 @@ def init_network(
 def features(
     networks: dict[str, Any], which: int | Count, scene: Scene, memory: Memory
 ) -> dict[str, jax.Array]:
-    """What the one of K networks that `which` () names sees: own (9,), pursuers (N,
-    16), pillars (P, 4), in_use (P,), greedy (3,), outward (2,), and active (N,) where
-    slots may be empty.
+    """The inputs of the one of K networks that `which` () names: own (9,), pursuers (N, 16),
+    pillars (P, 4), in_use (P,), greedy (3,), outward (2,), and active (N,) where slots may be
+    empty.
 
     Of itself: place in the arena, velocity, the greedy wish. Of each pursuer: offset
     and distance, how it moved over the last half and the whole of the memory, its
