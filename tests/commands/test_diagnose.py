@@ -98,7 +98,7 @@ def test_one_vehicle_has_no_page_beside_it(answers, tmp_path):
 def test_vehicles_differ_by_more_than_errors():
     sharp = [member_of(name, linked(delay)) for name, delay in (("a", 0.004), ("b", 0.018))]
     assert fleet_in_words(sharp) == [
-        "a and b differ: command latency delay 4 ms [2.36, 5.64], 18 ms elsewhere."
+        "a and b differ, in this order: command latency delay 4 ms [2.36, 5.64] against 18 ms."
     ]
     blunt = [member_of(n, linked(d, 0.01)) for n, d in (("a", 0.004), ("b", 0.018))]
     assert differences(blunt) == []

@@ -102,7 +102,7 @@ def test_a_headline_says_what_its_chart_shows():
     rest = {"effects": {"rotor_x": Share(0.03, (0.02, 0.05))}, "sensors": Share(0.04, (0.0, 0.1))}
     parts = dataclasses.replace(small.shares, **rest, unexplained=Share(0.93, (0.9, 0.95)))
     words = dataclasses.replace(small, shares=parts).headline()
-    assert "is 93 % unexplained; named is rotor x (3 %)" in words and "mostly" not in words
+    assert "is 93 % unexplained; the named part is rotor x (3 %)" in words and "mostly" not in words
 
 
 def test_a_constant_error_counts_whole():

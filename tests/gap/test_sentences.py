@@ -51,7 +51,7 @@ MEASURED = {
     "slow motors": identification(ratio=0.6, lag=0.049),
     "not trusted": identification(trusted=False),
 }
-SINCE = "Held against the reference flights of the same vehicle."
+SINCE = "Compared with the reference flights of the same vehicle."
 TRIMS = {"alone": None, "a normal day": change(0.0), "a weak rotor": change(0.2)}
 MADE = list(itertools.product(NAMED, MEASURED, TRIMS))
 
@@ -67,7 +67,7 @@ def test_every_sentence_agrees_with_every_other(named, measured, trims):
     advice = " ".join(why for why, _ in next_steps(made))
     agrees = made.headline() in (VERDICTS["none"], VERDICTS_SINCE["none"])
     assert ("Nothing needs correcting" in advice) == agrees == made.agrees
-    assert ("mend it" in advice) == ("rotor 3" in made.headline())
+    assert ("fix it" in advice) == ("rotor 3" in made.headline())
     if measured != "slow motors":
         return  # a page takes longer to draw than to read
     page = page_of(made)
@@ -105,7 +105,7 @@ def test_one_page_has_one_verdict_beside_a_reference():
     sag = dataclasses.replace(sag, reference=SINCE, trims=heavier)
     assert heavier.changed and "trims" not in sag.headline() and broken_rules(sag) == []
     both = dataclasses.replace(report(**NAMED["drag"]), reference=SINCE, trims=weak)
-    assert "The trims tell of more" in both.headline()
+    assert "The trims point to more" in both.headline()
 
 
 @pytest.mark.parametrize(
@@ -130,12 +130,12 @@ def test_a_report_that_names_nothing_tells_of_numbers_that_differ():
     assert "agrees" in slightly.headline() and "28" not in " ".join(slightly.in_words())
     # a cause is named, and the lag beside it is told as a measurement
     drag = dataclasses.replace(report(**NAMED["drag"]), identification=identification(lag=0.049))
-    assert "Measured too, but not named" in " ".join(drag.in_words())
+    assert "Also measured, but not named" in " ".join(drag.in_words())
 
 
 def test_an_interval_over_more_than_a_factor_of_ten_is_no_size():
     wide = Estimate(3.0, "1", (0.05, 20.0), (0.7, 1.6))
-    assert "between 0.05 and 20, which is no size" in wide.in_words("zz")
+    assert "between 0.05 and 20, too uncertain for a size" in wide.in_words("zz")
     inertia = dataclasses.replace(report(), parameters={"inertia": {"zz": wide}})
     assert to_fly(inertia)[0]["inertia"]["zz"] == 1.0
     assert Estimate(3.0, "1", (1.0, 9.0), (0.7, 1.6)).is_size

@@ -114,13 +114,14 @@ def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
 
 
 def _days_in_words(report: Report, of_days: Collection[str], trims: Change | None) -> str:
-    """A sentence on how days affect the named effects, and those that trims suggest without a name.
-    """
+    """A sentence on how days affect the named effects, and those that trims suggest without a name."""
     if trims is not None and of_days:
         names = " and ".join(sorted(of_days)).replace("_", " ")
-        return f" Trims differ as {names} would make them, and by no more than days do."
+        return f" Trims differ in the way of {names}, but by no more than they do between days."
     if trims is None and report.reference and set(report.named) & set(OF_DAYS):
-        return " Days alone move trims by 1 to 2.5 % of hover: so small a change may be the day's."
+        return (
+            " Trims move by 1 to 2.5 % of hover between days: so small a change may be the day's."
+        )
     return ""
 
 
@@ -268,11 +269,11 @@ def _reference_in_words(evidence: Evidence, effects) -> str:
         and e not in OF_DAYS
         and evidence.baseline.theta[PLACE[e, p]] != ABSENT[PLACE[e, p]]
     ]
-    text = "Held against the reference flights of the same vehicle"
+    text = "Compared with the reference flights of the same vehicle"
     text += f", in which {', '.join(values)}." if values else "."
     battery = (
-        "The battery's charge may differ between the days, which changes what thrust a duty cycle "
-        "makes: log vbat, and thrust can be compared."
+        "The battery's charge may differ between days, and with it the thrust of a duty cycle. Log "
+        "vbat to compare thrust."
     )
     return f"{text} {battery}" if evidence.charge_unknown else text
 
@@ -324,6 +325,6 @@ def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
         entries["gyroscope gain"] = f"{evidence.sensors.gain:.3f}"
     if "motor_rows" not in evidence.case.vehicle_file.log:
         entries["rows of motor commands"] = (
-            "taken for means over the row: [log] motor_rows doesn't say"
+            "taken as means over the row, as vehicle.toml has no [log] motor_rows"
         )
     return entries

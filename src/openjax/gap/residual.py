@@ -86,7 +86,7 @@ class Check:
     def in_words(self) -> str:
         """A sentence on what is left."""
         return (
-            f"What is left isn't noise (p = {self.p_value:.2g}): {self.finding}."
+            f"The remaining error isn't noise (p = {self.p_value:.2g}): {self.finding}."
             if self.rejects
             else ""
         )

@@ -79,7 +79,7 @@ class Gap:
             f"{100 * self.reduction:.0f} % smaller [{low:.0f}, {high:.0f}]."
         )
         if self.reduction < 0:
-            text += " Careful: with these effects the held-out predictions got worse."
+            text += " Caution: with these effects, held-out predictions are worse."
         return text
 
 

@@ -164,4 +164,4 @@ def in_words(places: list[Place]) -> str:
         name = f"{words[kind]} {axis}" if kind in words else place.channel
         regime = place.regime.replace("_", " ")
         parts.append(f"{name} in {regime} flight ({place.before:.1f} times the noise floor)")
-    return "; ".join(parts) or "no channel stands out of the noise"
+    return "; ".join(parts) or "no channel stands out from the noise"

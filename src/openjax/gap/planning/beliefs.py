@@ -140,7 +140,7 @@ def sentence(advice: Advice, report: dict) -> str:
     if weigh:
         text += f" No flight tells {weigh[0][0]} from {weigh[0][1]}: weigh the vehicle."
     if mends := _to_mend(report):
-        text += f" Before that, {' and '.join(mends)}: no flight shows more without."
+        text += f" Before that, {' and '.join(mends)}: otherwise no flight shows more."
     return text.replace("_", " ")
 
 

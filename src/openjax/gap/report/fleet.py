@@ -40,7 +40,7 @@ class Difference:
     def in_words(self) -> str:
         """The number, and the others'."""
         others = self.value.beside(self.others)
-        return f"{words_of(self.number)} {self.value.as_text()}, {others} elsewhere"
+        return f"{words_of(self.number)} {self.value.as_text()} against {others}"
 
 
 def member_of(name: str, answer: Report | Change) -> Member:
@@ -91,7 +91,7 @@ def fleet_in_words(members: Sequence[Member]) -> list[str]:
     if len(members) == 2:  # each differs from the other
         name, numbers = next(iter(by_vehicle.items()))
         other = next(m.name for m in members if m.name != name)
-        return [f"{name} and {other} differ: {'; '.join(numbers)}."]
+        return [f"{name} and {other} differ, in this order: {'; '.join(numbers)}."]
     return [f"{name} differs from the others: {'; '.join(n)}." for name, n in by_vehicle.items()]
 
 
@@ -129,6 +129,6 @@ def _cell(number: str, member: Member, marks: set[tuple[str, str]]) -> dict:
     quantity = member.numbers.get(number)
     return {
         "vehicle": member.name,
-        "text": "not told" if quantity is None else quantity.as_text(),
+        "text": "not measured" if quantity is None else quantity.as_text(),
         "differs": (number, member.name) in marks,
     }

@@ -106,7 +106,7 @@ def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, st
         steps.append((reason, "openjax plan . --out next_flight"))
     by_trims = report.change_by_trims
     if by_trims is not None:
-        reason = f"Look whether {by_trims.causes_in_words()}, mend it, and fly again."
+        reason = f"Check whether {by_trims.causes_in_words()}, fix it, and fly again."
         steps.append((reason, ""))
     flown_with = [*report.parameters, *report.departures]
     if flown_with:
@@ -117,7 +117,8 @@ def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, st
         steps.append(("Or train from scratch in the corrected simulator:", train))
     if report.left_out:
         reason = (
-            "Mend the logs that were left out, and diagnose again: each says above what is wrong."
+            "Fix the logs that were left out, and diagnose again. The top of this page says what is "
+            "wrong with each."
         )
         steps.append((reason, ""))
     case = _case_from(report, folder)
@@ -127,8 +128,8 @@ def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, st
     if "unknown" in report.effects:
         follows = f" {report.rest}" if report.rest else ""
         reason = (
-            f"Look for what is not on the list of effects.{follows} Did anything change since it "
-            "flew well?"
+            f"Look for a cause that is not on the list of effects.{follows} Has anything changed "
+            "since the vehicle last flew well?"
         )
         steps.append((reason, f"openjax diagnose {case} --reference EARLIER_FLIGHTS"))
     if report.to_show:

@@ -17,7 +17,7 @@ VERDICTS = {
 }
 """What is said of each verdict that names nothing."""
 VERDICTS_SINCE = {
-    "none": "The vehicle is as in its reference flights, to within what days differ by.",
+    "none": "The vehicle flies as in its reference flights, within the usual spread between days.",
     "unknown": "The vehicle changed in a way that no known effect explains.",
     "not_testable": "No change is seen, but these flights could not have shown most changes.",
 }
@@ -46,7 +46,7 @@ class Estimate:
         low, high = self.interval90
         unit = "" if self.unit == "1" else f" {self.unit}"
         if not self.is_size:
-            return f"{name} between {low:.2g} and {high:.2g}{unit}, which is no size"
+            return f"{name} between {low:.2g} and {high:.2g}{unit}, too uncertain for a size"
         text = f"{name} = {self.value:.4g} [{low:.4g}, {high:.4g}]{unit}"
         return f"{text} (unusual)" if self.unusual else text
 
@@ -243,7 +243,7 @@ class Report:
         if self.named:
             parts.append(self._named_in_words())
             if by_trims is not None:
-                parts.append(f"The trims tell of more: {by_trims.causes_in_words()}.")
+                parts.append(f"The trims point to more: {by_trims.causes_in_words()}.")
         elif by_trims is not None:
             parts.append(by_trims.sentence())
         else:
@@ -256,8 +256,7 @@ class Report:
         return " ".join(parts)
 
     def _named_in_words(self) -> str:
-        """The share of the gap that the named effects cause, and how much they improve predictions.
-        """
+        """The share of the gap that the named effects cause, and how much they improve predictions."""
         what = "What changed since the reference" if self.reference else "What the simulator misses"
         values = [self.shares.effects[effect].value for effect in self.named]
         parts = " and ".join(
@@ -270,7 +269,7 @@ class Report:
                 "of sensors and clocks": self.shares.sensors.value,
             }
             other = max(rest, key=rest.get)
-            text = f"{what} is {100 * rest[other]:.0f} % {other}; named is {parts}"
+            text = f"{what} is {100 * rest[other]:.0f} % {other}; the named part is {parts}"
         else:
             qualifier = "" if sum(values) > 0.995 else "mostly "  # 100 % as it is printed
             text = f"{what} is {qualifier}{parts}"
@@ -297,7 +296,7 @@ class Report:
         if numbers:
             lines.append(f"Measured: {'; '.join(numbers)}.")
         if others:
-            lines.append(f"Measured too, but not named: {'; '.join(others)}.")
+            lines.append(f"Also measured, but not named as causes: {'; '.join(others)}.")
         return lines
 
     def shares_in_words(self) -> str:
@@ -352,8 +351,8 @@ class Report:
             lines.append(f"{effect}: {', '.join(values)}.")
             if all(estimate.may_be_none for estimate in estimates.values()):
                 doubts.append(
-                    f"Flights disagree about {effect}: it may be none at all. Were they of one "
-                    "vehicle, and alike?"
+                    f"Flights disagree about {effect}, which may not act at all. Was it one "
+                    "vehicle, flown in the same way?"
                 )
         for effect, others in self.equivalent.items():
             doubts.append(f"These flights can't tell {effect} from {', '.join(others)}.")

@@ -15,7 +15,7 @@ from openjax.gap.model.library import CARDS
 from openjax.gap.report.report import Report
 from openjax.show.pages import AFTER, BEFORE, STYLE, as_svg
 
-DIFFERS = ("differs: a cause below", "differs: in effects.toml, no cause below")
+DIFFERS = ("differs: see the causes", "differs: in effects.toml, but no named cause")
 """What is said of numbers that matter."""
 PANEL = (2.9, 4.0)  # inches, of one axis
 
