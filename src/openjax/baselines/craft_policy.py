@@ -18,7 +18,7 @@ class CraftPolicy(Policy):
     craft: Craft = dataclasses.field(default_factory=Craft)
 
     NAME: ClassVar[str]
-    """What errors call it."""
+    """Its name in errors."""
 
     @staticmethod
     def start() -> tuple[float, ...]:

@@ -97,9 +97,9 @@ class Calibration:
 
     quantities: dict[str, FittedConstant]
     cannot_tell: tuple[str, ...]
-    """What these flights leave open, in words."""
+    """Questions that these flights leave open, in words."""
     nuisances: dict[str, tuple[float, str]] = field(default_factory=dict)
-    """What was fitted beside: {name: (value, unit)}."""
+    """Values that were fitted too: {name: (value, unit)}."""
     explained: dict[str, tuple[float, float]] = field(default_factory=dict)
     """{kind of channel: share of its changes that the nominal vehicle explains, and the
     fitted one}.

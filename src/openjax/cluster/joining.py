@@ -33,7 +33,7 @@ class Membership:
     num_processes: int
     process_id: int
     detection: str
-    """What JAX is to ask for this process' devices: `slurm`, `ompi`, or `deactivate`
+    """The system that JAX asks for this process' devices: `slurm`, `ompi`, or `deactivate`
     (all of the host).
     """
 

@@ -31,9 +31,9 @@ class Peer(NamedTuple):
 
     socket: socket.socket
     reader: BinaryIO
-    """What comes from there."""
+    """The data that come from there."""
     host: str
-    """Where that process runs."""
+    """The host of that process."""
 
 
 class Processes:

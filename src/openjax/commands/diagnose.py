@@ -58,7 +58,7 @@ class Options:
     motor commands alone are enough.
     """
     out: Path = Path("diagnosis")
-    """Where the reports go, one folder per case."""
+    """Folder of the reports, one folder per case."""
     predictions: Path | None = None
     """Also write all cases' answers into this one JSON file."""
     without: Annotated[tuple[str, ...], tyro.conf.arg(help=_WITHOUT_HELP)] = ()

@@ -69,7 +69,7 @@ class FlyCommand:
     out: Path | None = None
     """Folder for the logs, a case for openjax.diagnose; must not exist or be empty."""
     vehicle: Path | None = None
-    """What flies (crazyflie, brushless, or a vehicle.toml); by default the airframe
+    """The vehicle that flies (crazyflie, brushless, or a vehicle.toml); by default the airframe
     that the policy was trained for.
     """
     body_logs: Annotated[int | None, Interval("[0, 5]")] = None

@@ -29,7 +29,7 @@ class PlanCommand:
     out: Path = Path("plan")
     """Folder to write to; must not exist or be empty."""
     vehicle: str | None = None
-    """What flies (crazyflie, brushless, or a vehicle.toml); by default the vehicle that
+    """The vehicle that flies (crazyflie, brushless, or a vehicle.toml); by default the vehicle that
     was diagnosed, if its file is still there.
     """
 

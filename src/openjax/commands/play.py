@@ -32,7 +32,7 @@ class PlayCommand(FlightOptions):
     opponent: tyro.conf.Suppress[str | None] = None
     """You."""
     port: Annotated[int, Interval("[0, 65535]")] = 8080
-    """Where the page is served, on this machine only."""
+    """Port of the page, on this machine only."""
     browser: bool = True
     """Open a browser with the page."""
 

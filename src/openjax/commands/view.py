@@ -42,7 +42,7 @@ class ViewCommand(FlightOptions):
     flights: Path | None = None
     """A folder of flight logs to write with --mcap, in place of flying policies."""
     port: Annotated[int, Interval("[0, 65535]")] = 8080
-    """Where the page is served, on this machine only."""
+    """Port of the page, on this machine only."""
     browser: bool = True
     """Open a browser with the page."""
 

@@ -44,7 +44,7 @@ class Array:
     strides: tuple[int, ...]
     offset: int = 0
     buffer: Buffer | None = None
-    """Where it lies in the workspace; None for inputs, results and constants."""
+    """Its place in the workspace; None for inputs, results and constants."""
     number: str = ""
     """The value of all entries, where it is known and the same."""
 

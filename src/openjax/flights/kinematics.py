@@ -47,7 +47,7 @@ class Kinematics:
     streams leave of each other is noise, not time.
     """
     findings: dict[str, str]
-    """What is off by more than usual, in words, by name."""
+    """Quantities that are off by more than usual, in words, by name."""
     motor_clock: bool = True
     """The same of motors and gyroscope, see `MotorClock`."""
     motors_late: Mapping[str, float] = field(default_factory=dict)

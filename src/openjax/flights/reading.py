@@ -38,7 +38,7 @@ class LogTable:
     duty_cycles: bool = False
     """True if the format says that m1 to m4 are duty cycles."""
     clock_start: float | None = None
-    """What the log's clock read at t = 0, s: since 1970, or since the flight's start; None
+    """The log's clock at t = 0, s: since 1970, or since the flight's start; None
     for a clock of the vehicle's own.
     """
 

@@ -61,9 +61,9 @@ class CaseFolder:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        """Where it is."""
+        """Its place."""
         self.refusal = ""
-        """What the first place had against it."""
+        """The reason why the first place was refused."""
         self.complete = True
         """True if everything was written, here or there."""
         name = f"openjax-{folder.absolute().name}-{os.getpid()}"

@@ -52,7 +52,7 @@ class PoseLimits:
     body_rate: float = math.radians(2000.0)
     """Full scale of the gyroscope on board (rad/s); BMI088 data sheet."""
     horizon: float = 0.06
-    """How long (s) a vehicle is flown without a good pose;
+    """Time (s) for which a vehicle is flown without a good pose;
     `SafetySettings.pose_timeout`.
     """
     drift: float = 0.25
@@ -70,7 +70,7 @@ class PoseLimits:
     rate: float = 1.0
     """Error of one body rate (rad/s): propellers shake the gyroscope."""
     unit: float = 0.02
-    """How far a quaternion's length may be from one: 9 bits a component on board."""
+    """The most by which a quaternion's length may differ from one: 9 bits a component on board."""
     apart: float = 0.1
     """Distance (m) between motion capture and the own estimate: 5 standard errors of
     two of .01 m, and 30 ms at 1 m/s.

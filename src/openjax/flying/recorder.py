@@ -56,7 +56,7 @@ class LogOutcome(NamedTuple):
     longest: float = 0.0
     """Of its games (s)."""
     complaint: str = ""
-    """Where it isn't what and where it was to be."""
+    """Differences from what it should be, and from where."""
 
 
 class Recorder:

@@ -81,7 +81,7 @@ class Session:
         )
         self._guard: Guard | None = None
         self.scheduler = "ordinary"
-        """What of the real-time scheduler was granted, see
+        """The parts of the real-time scheduling that were granted, see
         `openjax.flying.real_time`.
         """
         self._raw_links: RawLinks | None = None

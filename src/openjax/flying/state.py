@@ -67,7 +67,7 @@ class SafetySettings:
     `battery_time`.
     """
     battery_time: Annotated[float, Interval("[0, 60]")] = 0.5
-    """How long the voltage must be low (s): a sudden climb takes it down for a
+    """Time for which the voltage must be low (s): a sudden climb takes it down for a
     moment.
     """
     battery_start: Annotated[float, Interval("[0, 100]")] = 3.7
@@ -133,7 +133,7 @@ class PoseSample(NamedTuple):
     own: Pose | None
     """The newest estimate of the vehicle itself."""
     last_contact: float
-    """When its link last said anything (s)."""
+    """Time of its link's last message (s)."""
     voltage: float = math.nan
     supervisor: int = Supervisor.ARMED | Supervisor.CAN_FLY
     """The firmware's word on its state."""

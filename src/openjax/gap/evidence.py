@@ -47,11 +47,11 @@ class Evidence:
     motion: Motion
     """Of the physics."""
     baseline: Baseline | None = None
-    """What the vehicle is like while nothing acts; None where that isn't known."""
+    """The vehicle while nothing acts; None if unknown."""
     identification: Identification | None = None
-    """What the torques do in closed loop."""
+    """The response of the torques in closed loop."""
     torques: Torques | None = None
-    """What that says of causes; None where it isn't trusted."""
+    """Its evidence on causes; None if it isn't trusted."""
 
     @property
     def replay(self) -> Replay:

@@ -61,7 +61,7 @@ class Check:
     reference: dict[str, float] | None = None
     mostly_unknown: bool = False
     by_reference: bool = False
-    """Whether what stands out most was held against the reference: of forces and torques
+    """True if what stands out most was compared with the reference: of forces and torques
     it can't be where a battery that nobody logged may have changed them.
     """
 

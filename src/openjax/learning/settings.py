@@ -51,7 +51,7 @@ class MappoSettings:
     MAX_GRAD_NORM = 10.0
     """Global norm to which gradients are cut, actor and critic each."""
     HUBER = 10.0
-    """Where the value loss turns linear, in standard deviations of the returns."""
+    """The error at which the value loss turns linear, in standard deviations of the returns."""
     VALUE_COEFFICIENT = 1.0
     """Weight of the value loss; it matters where actor and critic share an encoder."""
     VALUE_NORM_DECAY = 0.95
@@ -122,7 +122,7 @@ class EvaderLearningSettings:
     """PPO of evaders that learn; see `openjax.learning.learners.evasion`."""
 
     past: Annotated[int, Interval("[0, 64]")] = 0
-    """How many of a game's learned evaders, the last ones, are earlier selves of the
+    """Number of a game's learned evaders, the last ones, that are earlier selves of the
     others: who only meets the newest ones unlearns what beat the older ones.
     """
 
@@ -242,7 +242,7 @@ class AnalyticSettings:
     """
 
     DRAWS = 4
-    """How many times as many starts are flown as are learnt from: the hardest."""
+    """The ratio of starts flown to starts learnt from, which are the hardest."""
     BREACH = 2.0
     """Weight of the breaches per step in flight, beside the share of pursuers that
     touch something from a start; see `team_weight`.

@@ -22,17 +22,17 @@ class NetworkSettings:
     initial_log_std: Annotated[float, Interval("[-10, 2]")] = -0.5
     """Start of the Gaussian policy's state-independent log standard deviation."""
     squash: Literal["mean", "sample"] = "mean"
-    """What the tanh bounds. "mean": exploration is added after it and cut at the
+    """The value that the tanh bounds. "mean": exploration is added after it and cut at the
     bounds, so that the mean policy does what the exploring one does on average;
     "sample": exploration passes through the tanh, which shifts that average.
     """
     output: Literal["commands", "velocity", "field"] = "commands"
-    """What the actor puts out. "commands": thrust and body rates; "velocity": a
+    """The actor's output. "commands": thrust and body rates; "velocity": a
     velocity, which a controller flies; "field": parameters of a potential field, whose
     force that controller flies (DACOOP).
     """
     critic_encoder: Literal["attention", "layers"] = "attention"
-    """What the critic begins with, unless it shares the actor's encoder. "attention":
+    """The critic's first layers, unless it shares the actor's encoder. "attention":
     an encoder like the actor's; "layers": two layers, twice as wide as `features`, on
     all that it sees: a third of the work on a CPU.
     """

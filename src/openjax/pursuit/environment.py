@@ -131,11 +131,11 @@ class Pursuit:
     See `openjax.pursuit.evaders`.
     """
     dynamics: Dynamics | None = None
-    """What moves the pursuers; None: the physics that the settings name, with the
+    """The dynamics of the pursuers; None: the physics that the settings name, with the
     effects.
     """
     evaders: tuple[Evader, ...] | None = None
-    """Who flies away, one of them in each episode: names, rows, or functions of one's
+    """The evaders, one of them in each episode: names, rows, or functions of one's
     own (`openjax.pursuit.evaders.EvaderKind`); they go before those that the settings
     name. None: these.
     """

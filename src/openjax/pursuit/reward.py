@@ -68,7 +68,7 @@ class Transition:
     state: PursuitState
     """After the step."""
     info: StepInfo
-    """What happened in it; its `penalty` isn't known yet."""
+    """The events in it; its `penalty` isn't known yet."""
 
     @property
     def pillars(self) -> tuple[Pillars, Active]:

@@ -245,7 +245,7 @@ class PursuitSettings:
     history_spacing: Annotated[int, Interval("[1, 1000]")] = 1
     """Control steps between two frames of either history."""
     history_pursuers: Literal["each", "pooled", "both"] = "each"
-    """What these frames hold of the pursuers. "each": all positions, as in the paper;
+    """The part of the pursuers that these frames hold. "each": all positions, as in the paper;
     "pooled": where the nearest one is and whence all press, for teams of any size;
     "both": for a team of policies of both kinds.
     """

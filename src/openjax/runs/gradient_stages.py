@@ -44,7 +44,7 @@ class FirstFlightsProgram:
     `TOGETHER` updates, or all of fewer.
     """
     places: Any
-    """Where its arguments lie: a sharding, None for the first device."""
+    """The place of its arguments: a sharding, None for the first device."""
 
     def wait(self) -> None:
         """Until both are compiled."""

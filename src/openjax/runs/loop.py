@@ -150,7 +150,7 @@ class Loop:
     """Gathers a value of each process, as `Processes.everyone` does."""
     began: float = dataclasses.field(default_factory=time.monotonic, init=False)
     saved_at: float = dataclasses.field(default_factory=time.monotonic, init=False)
-    """When the last checkpoint was written."""
+    """The time of the last checkpoint."""
     best_score: float = dataclasses.field(default=-float("inf"), init=False)
 
     def run(self, carry: Any) -> Outcome:

@@ -65,7 +65,7 @@ class RunState:
     is_due: bool
     """True if the carry is to be validated before anything else."""
     deadline: float = float("inf")
-    """When the time for learning is over (`time.monotonic`)."""
+    """The end of the time for learning (`time.monotonic`)."""
 
 
 def begin(run: Run) -> RunState:

@@ -69,11 +69,11 @@ class TrainCommand:
     coordinator_address: str | None = None
     """With several processes: host:port of process 0. Slurm and Open MPI tell it."""
     num_processes: Annotated[int | None, Interval("[1, 100000]")] = None
-    """How many processes train together, for example one per host. Slurm and Open MPI
+    """Number of processes that train together, for example one per host. Slurm and Open MPI
     tell it.
     """
     process_id: Annotated[int | None, Interval("[0, 99999]")] = None
-    """Which of them this one is, from 0. Slurm and Open MPI tell it."""
+    """This process' number, from 0. Slurm and Open MPI set it."""
     compilation_cache: bool = True
     """Keep traced and compiled programs in the user's cache folder, so that the next run
     starts sooner.

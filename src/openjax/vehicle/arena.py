@@ -12,5 +12,5 @@ class Arena:
     radius: float = 0.9
     """Its wall is no solid thing: flying beyond it is a breach."""
     height: float = 1.2
-    """Where the ceiling is and the pillars end."""
+    """Height of the ceiling and of the pillars."""
     pillar_radius: float = 0.1

@@ -51,21 +51,21 @@ class Reading:
     """The commands that the link let through; None without commands."""
     sensors: Kinematics
     pwm: bool
-    """Whether motors are duty cycles."""
+    """True if motors are duty cycles."""
     at_once: bool
-    """Whether a row's motors are one sample, as the vehicle file's [log] says by
+    """True if a row's motors are one sample, as the vehicle file's [log] says by
     motor_rows = "sample".
     """
     blind: bool
-    """Whether it isn't known what motors do within a row."""
+    """True if it is unknown what motors do within a row."""
     late: float | None
     """By how much motors may be off against the gyroscope (s); None where that isn't
     known.
     """
     baseline: Baseline | None = None
-    """What the vehicle is like while nothing acts; None where that isn't known."""
+    """The vehicle while nothing acts; None if unknown."""
     reference: bool = False
-    """Whether that is what these flights are to tell."""
+    """True if these flights are to tell that."""
 
     @property
     def numbers(self):

@@ -80,7 +80,7 @@ class Radio(Channel):
     """{parameter: effect} of the library."""
     row: float = 0.01  # s
     single_samples: bool = False
-    """Whether a row's motors are one sample."""
+    """True if a row's motors are one sample."""
     path = "radio"
 
     @property

@@ -37,7 +37,7 @@ class Estimate:
     usual: tuple[float, float]
     """Its prior range."""
     may_be_none: bool = False
-    """Whether the interval holds the value at which the effect does nothing."""
+    """True if the interval holds the value at which the effect does nothing."""
 
     def in_words(self, name: str) -> str:
         """The value of the parameter `name` with its interval and unit, and whether it
@@ -89,12 +89,12 @@ class Report:
     next_flight: str = ""
     """The segment that tells most, in words; empty where little is left open."""
     to_show: str = ""
-    """What to fly and log for an effect that no segment shows."""
+    """Advice on flying and logging for an effect that no segment shows."""
     vehicle: str = ""
     """The vehicle file of the flights."""
     runner_up: str = ""
     rest: str = ""
-    """What is left when the named effects are accounted for."""
+    """A sentence on what the named effects leave."""
     links: dict[str, Quantity] = field(default_factory=dict)
     """{"effect.parameter": number} of pose, radio and rate loop."""
     sensors: tuple[str, ...] = ()
@@ -103,15 +103,15 @@ class Report:
     """{name: what it took}."""
     residual: dict[str, float] = field(default_factory=dict)
     residual_before: dict[str, float] = field(default_factory=dict)
-    """What the reference leaves of the same measures."""
+    """The same measures of the reference."""
     reference: str = ""
-    """What the reference flights say of the vehicle; empty: none were given."""
+    """A sentence on the reference flights; empty if none were given."""
     trims: Change | None = None
-    """What trims say of a change since the reference; None: there is none, or its logs
+    """The trims' evidence of a change since the reference; None: there is none, or its logs
     show none.
     """
     identification: Identification | None = None
-    """What the vehicle does; None: no motors were logged."""
+    """The measured response; None if no motors were logged."""
     seconds: float = 0.0
     plots: dict = field(default_factory=dict, repr=False)
     """Arrays for the pictures; no part of the JSON."""

@@ -29,7 +29,7 @@ class EvaderKind:
     what it knows, `memory` has as many numbers.
     """
     of: Literal["train", "validation", "held out", "file"] = "train"
-    """What it may be used for: held-out ones are never trained on, nor are checkpoints
+    """Its permitted use: held-out ones are never trained on, nor are checkpoints
     chosen by them. "file": it comes from one, or is handed in.
     """
     look_ahead: tuple[float, ...] = (0.15,)
@@ -39,7 +39,7 @@ class EvaderKind:
     sees_all: tuple[bool, ...] = (True,)
     """True if it knows of all pursuers, or of those in its sight."""
     acceleration: tuple[float, ...] = (UNBOUNDED,)
-    """How fast its velocity changes at most where nothing is in its way (m/s^2)."""
+    """The largest rate of change of its velocity while nothing is in its way (m/s^2)."""
     speed: tuple[float, ...] = (1.0,)
     """Its speed, as a share of the game's `evader_speed`."""
     memory: int = MEMORY

@@ -137,7 +137,7 @@ class Parameter:
     prior: tuple[float, float]
     """The usual range in the parameter's unit: weak, not a bound."""
     source: str
-    """Where that range comes from."""
+    """The source of that range."""
     meaning: str = ""
     domain: Domain | Callable[[Vehicle], Domain] = (-np.inf, np.inf)
     """The range in which it means anything, as numbers or by the vehicle."""
@@ -168,13 +168,13 @@ class Fitted:
     spread: float
     """Standard deviation of the prior."""
     start: float
-    """Where the search starts."""
+    """The start of the search."""
     step: float
     """Of the difference quotient."""
     error: float = 0.0
     """Standard deviation that the rows of a log leave, whatever a fit says."""
     most: float = float("inf")
-    """Where the search ends."""
+    """The end of the search."""
 
 
 # In round numbers: nobody has counted how often vehicles have an effect.
@@ -343,7 +343,7 @@ class Effect:
     formula: str = ""
     """Its formula in LaTeX, for the documentation."""
     card: Card | None = None
-    """How the diagnosis tells it; without one it can be flown with, but not be
+    """The means by which the diagnosis finds it; without one it can be flown with, but not be
     diagnosed.
     """
 
