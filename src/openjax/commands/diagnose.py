@@ -178,7 +178,7 @@ def _outputs(options: Options, names: Sequence[str]) -> list[Path]:
 
 
 def _diagnosis(options: Options, folder: Path, name: str, tell: Callable[[str], None]) -> Answer:
-    """The causes of a case's gap, or what changed since the reference, once its report is written."""
+    """The causes of a case's gap, or the change since the reference, once its report is written."""
     from openjax.gap.folders import diagnose_folder
     from openjax.gap.report import write_report
     from openjax.gap.report.fleet import member_of

@@ -1,4 +1,4 @@
-"""The vehicle that a URI means, however it is written, and a lock so that nobody else commands it."""
+"""The vehicle that a URI means, however written, and a lock so that nobody else commands it."""
 
 import contextlib
 import re

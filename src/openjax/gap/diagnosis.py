@@ -114,7 +114,7 @@ def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
 
 
 def _days_in_words(report: Report, of_days: Collection[str], trims: Change | None) -> str:
-    """A sentence on how days affect the named effects, and those that trims suggest without a name."""
+    """A sentence on how days affect the named effects, and those that trims alone suggest."""
     if trims is not None and of_days:
         names = " and ".join(sorted(of_days)).replace("_", " ")
         return f" Trims differ in the way of {names}, but by no more than they do between days."

@@ -102,7 +102,7 @@ def _is_looked_at(stage, update):
 
 
 def _in_words(facts, updates, score):
-    """A line on what that many updates made of the policy; `score` is that of the one that is kept."""
+    """A line on the policy after that many updates; `score` is that of the one that is kept."""
     scores = facts["validation_scores"]
     course = f"{scores[0]:.4f} -> {score:.4f} after {facts['kept']} of {updates} updates"
     if not facts["kept"]:

@@ -117,8 +117,8 @@ def next_steps(report: Report, folder: Path | None = None) -> list[tuple[str, st
         steps.append(("Or train from scratch in the corrected simulator:", train))
     if report.left_out:
         reason = (
-            "Fix the logs that were left out, and diagnose again. The top of this page says what is "
-            "wrong with each."
+            "Fix the logs that were left out, and diagnose again. The top of this page says "
+            "what is wrong with each."
         )
         steps.append((reason, ""))
     case = _case_from(report, folder)

@@ -256,7 +256,7 @@ class Report:
         return " ".join(parts)
 
     def _named_in_words(self) -> str:
-        """The share of the gap that the named effects cause, and how much they improve predictions."""
+        """The share of the gap that the named effects cause, and their use for predictions."""
         what = "What changed since the reference" if self.reference else "What the simulator misses"
         values = [self.shares.effects[effect].value for effect in self.named]
         parts = " and ".join(

@@ -76,7 +76,7 @@ class LastFlights:
 
     @property
     def moments(self) -> int:
-        """The number of times a flight is looked at: after each `HORIZON` but the episode's last."""
+        """Number of times a flight is looked at: after each `HORIZON` but the episode's last."""
         # what is learnt from a moment takes another `HORIZON`, which has to end with
         # the episode
         return max(1, self.flight.game.episode_length // self.steps - 1)

@@ -186,7 +186,7 @@ class WorstPlans:
     def attempts(
         self, actor: Any, parameters: PolicyParameters, world, plan: Plan, key: PRNGKeyArray
     ) -> Trials:
-        """The outcome of the evaders' plans in worlds (B, ...); `plan` is the rest of the last one."""
+        """Outcome of the evaders' plans in worlds (B, ...); `plan` is the rest of the last."""
         fly_on = mean_step(self.environment, self.flight.policy, parameters)
 
         def fly(world, velocity, steps):
