@@ -6,6 +6,8 @@ import dataclasses
 import importlib.util
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -21,6 +23,7 @@ from openjax.store import DEFAULT_POLICY, TEAM_POLICY
 from openjax.store.environments import make_environment
 from openjax.store.policy_files import WEIGHTS, load_policy_file
 from openjax.vehicle.vehicle_file import load_vehicle_file
+from tests.test_commands import ALONE, STEPS, TINY
 
 ROOT = Path(__file__).parents[1]
 OTHER_RECIPE = "isn't the preset's recipe of today"
@@ -131,6 +134,31 @@ def test_python_of_the_readme_runs():
     exec(re.search(r"```python\n(.*?)```", README, re.DOTALL).group(1), names)
     assert names["record"]["capture_rate"] > 0.95
     assert names["observation"].position.shape == (3, 3)
+
+
+@pytest.mark.slow
+def test_both_doors_of_the_readme_open(tmp_path):
+    """Its commands as they are written, one after the other in one folder; only a training
+    is made smaller, and a page is written instead of served.
+    """
+    smaller = {"train": [*TINY, *STEPS, *ALONE], "view": ["--html", "chase.html"]}
+    text = " ".join(README.split())
+    written = dict.fromkeys(
+        re.findall(
+            r"openjax ((?:train|view|sample_flights|diagnose) [^`#]*?)"
+            r"(?= openjax| ```|`| \.\.\.)",
+            text,
+        )
+    )
+    assert {line.partition(" ")[0] for line in written} >= {*smaller, "sample_flights", "diagnose"}
+    # a flight of virtual vehicles has tests of its own
+    for line in (line for line in written if "first_flight" not in line):
+        command = [sys.executable, "-m", "openjax", *line.split()]
+        command += smaller.get(line.partition(" ")[0], [])
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, (line, done.stderr)
+    for path in ("runs/mine/policy.npz", "chase.html", "diagnosis/flights/report.html"):
+        assert (tmp_path / path).is_file(), path
 
 
 @pytest.mark.slow
