@@ -1,0 +1,65 @@
+"""Pages are read on a phone: figures keep their letters, and nothing is wider than 400 pixels."""
+
+import dataclasses
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from matplotlib import rc_context
+
+from openjax.gap.report import figures, response, trims_page
+from openjax.gap.report.fleet import member_of, page_of_fleet
+from openjax.gap.report.page import page_of
+from openjax.show.pages import STYLE, add_legend, as_svg, small_figure
+from tests.gap.made_reports import change, identification, report
+
+EXTRA = Path(__file__).parents[2] / "docs" / "extra"
+PHONE = 400
+PADDING = 4 * 0.8 * 16  # pixels: both sides of the page and of a card, in style.css
+LEAST = 10.0  # pixels of a letter's height
+
+
+@pytest.mark.parametrize("size", [(figures.WIDTH, 3.0), response.PANEL, trims_page.PANEL], ids=str)
+def test_letters_of_figures_are_read_at_400_pixels(size):
+    with rc_context(STYLE):
+        figure, axes = small_figure(size)
+        axes.plot([0, 1], label="nominal simulator")
+        axes.set(xlabel="time in the flight [s]")
+        add_legend(axes)
+        svg = as_svg(figure, "phone")
+    width = float(re.search(r'viewBox="0 0 ([\d.]+) ', svg).group(1))
+    letters = [float(found) for found in re.findall(r"font(?:-size)?: (?:\w+ )*([\d.]+)px", svg)]
+    assert letters and min(letters) * (PHONE - PADDING) / width >= LEAST
+
+
+def pages():
+    """A report with all its parts, one of several vehicles, and the site's replay and map."""
+    full = report(("rotor_drag", "unknown"), "effect", before=4.0)
+    full = dataclasses.replace(
+        full, identification=identification(lag=0.049), trims=change(0.2), reference="Since Monday."
+    )
+    other = dataclasses.replace(report(), identification=identification())
+    return {
+        "report": page_of(full),
+        "vehicles": page_of_fleet([member_of("cf1", full), member_of("cf2", other)]),
+        "replay": (EXTRA / "replay" / "chase.html").read_text(encoding="utf-8"),
+        "map": (EXTRA / "map" / "catch.html").read_text(encoding="utf-8"),
+    }
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium on this machine")
+@pytest.mark.parametrize("name", ["report", "vehicles", "replay", "map"])
+def test_no_page_is_wider_than_a_phone(name, tmp_path):
+    """In a frame, as a browser's own window is never that narrow; tables scroll by themselves."""
+    (tmp_path / "page.html").write_text(pages()[name], encoding="utf-8")
+    measure = "document.title = this.contentDocument.documentElement.scrollWidth"
+    frame = f'<iframe src="page.html" style="width: {PHONE}px; border: 0" onload="{measure}">'
+    (tmp_path / "frame.html").write_text(f"<!doctype html><title></title>{frame}</iframe>")
+    command = "chromium --headless --no-sandbox --disable-gpu --no-first-run --dump-dom".split()
+    command += ["--allow-file-access-from-files", f"--user-data-dir={tmp_path / 'profile'}"]
+    command.append((tmp_path / "frame.html").as_uri())
+    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=240)
+    (width,) = re.findall(r"<title>(\d+)</title>", done.stdout)
+    assert int(width) <= PHONE
