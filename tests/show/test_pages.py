@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from matplotlib import rc_context
 
+from openjax.gap.identification.responses import Response
 from openjax.gap.report import figures, response, trims_page
 from openjax.gap.report.fleet import member_of, page_of_fleet
 from openjax.gap.report.page import page_of
@@ -32,6 +33,18 @@ def test_letters_of_figures_are_read_at_400_pixels(size):
     width = float(re.search(r'viewBox="0 0 ([\d.]+) ', svg).group(1))
     letters = [float(found) for found in re.findall(r"font(?:-size)?: (?:\w+ )*([\d.]+)px", svg)]
     assert letters and min(letters) * (PHONE - PADDING) / width >= LEAST
+
+
+def test_labels_of_a_response_lie_within_the_figure():
+    pair = identification().responses["roll"]
+    wide = Response("roll", (1.0, 10.0), ((1.0, 1500.0, 2000.0),) * 2, ((-190.0, -150.0, 0.0),) * 2)
+    with rc_context(STYLE):
+        figure = response._draw("roll", dataclasses.replace(pair, measured=wide))
+        figure.canvas.draw()
+    for axes in figure.axes:
+        label = axes.yaxis.label.get_window_extent()
+        assert label.x0 >= 0.0
+        assert all(label.x1 <= tick.get_window_extent().x0 for tick in axes.get_yticklabels())
 
 
 def pages():

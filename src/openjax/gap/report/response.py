@@ -55,7 +55,7 @@ def _limits() -> str:
         f"{least * 1e3:.0f} ms of {e}" if e in times else f"{least:.0%} of {e}"
         for e, least in MATTERS.items()
     ]
-    text = f"It matters from {', '.join(sizes)} on, or where predictions get worse without it."
+    text = f"That matters from {', '.join(sizes)} on, or if predictions get worse without it."
     return text.replace("_", " ").replace("%", " %")
 
 
@@ -104,7 +104,7 @@ def _draw(axis: str, pair: Pair) -> Figure:
     # inches around and between what is always as large; a layout that is searched for
     # takes as long as the drawing
     figure.subplots_adjust(
-        left=0.7 / width,
+        left=0.8 / width,
         right=1.0 - 0.1 / width,
         bottom=0.5 / height,
         top=1.0 - 0.1 / height,
@@ -121,4 +121,6 @@ def _draw(axis: str, pair: Pair) -> Figure:
     phase.set(xlabel="frequency [Hz]", ylabel="phase [°]")
     phase.set_xticks([1, 2, 5, 10], ["1", "2", "5", "10"])
     phase.xaxis.set_minor_locator(NullLocator())
+    for axes in (gain, phase):  # clear of "1000", and within the figure
+        axes.yaxis.set_label_coords(-0.55 / (width - 0.9), 0.5)
     return figure
