@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from matplotlib import rc_context
 
+from openjax.commands import adapt_report
 from openjax.gap.identification.responses import Response
 from openjax.gap.report import figures, response, trims_page
 from openjax.gap.report.fleet import member_of, page_of_fleet
@@ -22,7 +23,9 @@ PADDING = 4 * 0.8 * 16  # pixels: both sides of the page and of a card, in style
 LEAST = 10.0  # pixels of a letter's height
 
 
-@pytest.mark.parametrize("size", [(figures.WIDTH, 3.0), response.PANEL, trims_page.PANEL], ids=str)
+@pytest.mark.parametrize(
+    "size", [(figures.WIDTH, 3.0), response.PANEL, trims_page.PANEL, adapt_report.PANEL], ids=str
+)
 def test_letters_of_figures_are_read_at_400_pixels(size):
     with rc_context(STYLE):
         figure, axes = small_figure(size)
@@ -54,8 +57,21 @@ def pages():
         full, identification=identification(lag=0.049), trims=change(0.2), reference="Since Monday."
     )
     other = dataclasses.replace(report(), identification=identification())
+    rates = dict.fromkeys(adapt_report.FIGURES, 0.123)
+    adapted = {
+        "effects": ["rotor_drag"],
+        **dict.fromkeys(adapt_report.WHICH, rates),
+        "won_back": {"crash_rate": 0.8},
+        "history": [dict.fromkeys(adapt_report.RATES, 0.1)] * 2,
+        "parameters": [{"parameter": "rotor_drag.d_xy", "value": 0.01, "low": 0.0, "high": 0.02}],
+        "episodes": 100,
+        "kept": "the adapted policy, which is better",
+        "seconds": {"diagnosed": 10.0, "measured": 60.0},
+        "command": "openjax adapt flights/my_drone --policy flight --out adapted",
+    }
     return {
         "report": page_of(full),
+        "adapted": adapt_report.page(adapted),
         "vehicles": page_of_fleet([member_of("cf1", full), member_of("cf2", other)]),
         "replay": (EXTRA / "replay" / "chase.html").read_text(encoding="utf-8"),
         "map": (EXTRA / "map" / "catch.html").read_text(encoding="utf-8"),
@@ -63,7 +79,7 @@ def pages():
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium on this machine")
-@pytest.mark.parametrize("name", ["report", "vehicles", "replay", "map"])
+@pytest.mark.parametrize("name", ["report", "vehicles", "adapted", "replay", "map"])
 def test_no_page_is_wider_than_a_phone(name, tmp_path):
     """In a frame, as a browser's own window is never that narrow; tables scroll by themselves."""
     (tmp_path / "page.html").write_text(pages()[name], encoding="utf-8")

@@ -1,5 +1,6 @@
 """The report of `openjax adapt`: in lines for a terminal, and as a page."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 FIGURES = ("capture_rate", "capture_step", "collision_rate", "crash_rate", "over_speed_rate")
@@ -8,6 +9,14 @@ WHICH = ("nominal", "before", "after")
 """Whose: the policy's as it was, with the nominal and with the diagnosed vehicle, and
 the adapted policy's with that one.
 """
+
+RATES = {
+    "crashes_from_starts": "crashes from leaning starts (smooth)",
+    "crashes_in_flight": "crashes within flights (smooth)",
+    "off_the_nominal_flight": "distance from nominal flights",
+}
+"""Pictures of the page."""
+PANEL = (3.4, 2.6)  # inches
 
 
 def in_words(results: dict) -> list[str]:
@@ -20,17 +29,17 @@ def in_words(results: dict) -> list[str]:
         course = " → ".join(f"{results[which][name]:.3g}" for which in WHICH)
         changes.append(f"{name.replace('_', ' ')} {course}")
     gains = [
-        f"{name.replace('_', ' ')} {share:.0%}"
+        f"{name.replace('_', ' ')} {100 * share:.0f} %"
         for name, share in results["won_back"].items()
         if share is not None
     ]
-    gain = "What the vehicle costs is within chance."
+    gain = "The loss on this vehicle is within chance."
     if gains:
-        gain = f"Won back of what the vehicle costs: {', '.join(gains)}."
+        gain = f"Won back of the loss on this vehicle: {', '.join(gains)}."
     return [
         f"Found: {effects}.",
-        f"On {results['episodes']} tasks that neither was trained on, with the nominal vehicle → "
-        f"with vehicles drawn from what was found, before → after: {'; '.join(changes)}.",
+        f"On {results['episodes']} tasks that neither policy was trained on, with the nominal vehicle "
+        f"→ with the diagnosed vehicles → with these after adapting: {'; '.join(changes)}.",
         gain,
         f"Kept: {results['kept']}. {results['seconds']['measured']:.0f} s.",
     ]
@@ -45,26 +54,22 @@ def page(results: dict) -> str:
         "words": in_words(results),
         "figures": FIGURES,
         "which": WHICH,
-        "picture": _picture(results),
+        "pictures": pictures_of(results["history"]),
     }
     return fill_template("adapt.html.jinja", Path(__file__).parent, results=results, **values)
 
 
-def _picture(results):
+def pictures_of(history: Sequence[Mapping[str, float]]) -> list[tuple[str, str]]:
+    """(title, SVG) of each rate over the updates, which a phone shows one below another."""
     from matplotlib import rc_context
-    from matplotlib.figure import Figure
 
-    from openjax.show.pages import STYLE, as_svg
+    from openjax.show.pages import STYLE, as_svg, small_figure
 
-    rates = {
-        "crashes_from_starts": "crashes from leaning starts (smooth)",
-        "crashes_in_flight": "crashes within flights (smooth)",
-        "off_the_nominal_flight": "distance from nominal flights",
-    }
+    pictures = []
     with rc_context(STYLE):
-        figure = Figure(figsize=(11, 3.2), layout="constrained")
-        for axes, (name, title) in zip(figure.subplots(1, len(rates)), rates.items(), strict=True):
-            course = [row[name] for row in results["history"]]
-            axes.plot(range(1, len(course) + 1), course)
-            axes.set(title=title, xlabel="update", ylim=(0, None))
-        return as_svg(figure, results["policy"])
+        for name, title in RATES.items():
+            figure, axes = small_figure(PANEL)
+            axes.plot(range(1, len(history) + 1), [row[name] for row in history])
+            axes.set(xlabel="update", ylim=(0, None))
+            pictures.append((title, as_svg(figure, title)))
+    return pictures
