@@ -38,8 +38,8 @@ def in_words(results: dict) -> list[str]:
         gain = f"Won back of the loss on this vehicle: {', '.join(gains)}."
     return [
         f"Found: {effects}.",
-        f"On {results['episodes']} tasks that neither policy was trained on, with the nominal vehicle "
-        f"→ with the diagnosed vehicles → with these after adapting: {'; '.join(changes)}.",
+        f"On {results['episodes']} tasks that neither policy was trained on, with the nominal "
+        f"vehicle → with the diagnosed vehicles → with these after adapting: {'; '.join(changes)}.",
         gain,
         f"Kept: {results['kept']}. {results['seconds']['measured']:.0f} s.",
     ]
