@@ -5,7 +5,6 @@ The function is traced and what doesn't depend on its inputs is computed, as for
 Intermediate arrays share one workspace, which the caller provides.
 """
 
-import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ import jinja2
 from openjax.export.c_statements import Buffer, Writer, dense_array
 from openjax.export.c_text import dims, number_rows
 from openjax.export.traced import trace
+from openjax.pursuit.teams import draws_below
 
 _TEMPLATES = jinja2.Environment(
     loader=jinja2.FileSystemLoader(Path(__file__).parent),
@@ -51,7 +51,7 @@ class DrawnStrategies(NamedTuple):
         """A draw of 32 bits below the first number means strategy 0, below the second
         strategy 1, and so on.
         """
-        ends = itertools.accumulate(self.shares[:-1])
+        ends = draws_below(self.shares)
         return tuple(min(int(end * 2**32), 2**32 - 1) for end in ends)
 
     def in_words(self) -> str:

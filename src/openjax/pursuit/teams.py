@@ -135,13 +135,15 @@ def strategy_of(
     """(...) which strategy a `draw` from 0 to 1 means, by the odds of a team that sees
     the evader or doesn't.
     """
-    usual = _below(settings.strategy_odds or (1.0,) * settings.strategies)
-    while_unseen = _below(settings.strategy_odds_unseen) if settings.strategy_odds_unseen else usual
+    usual = draws_below(settings.strategy_odds or (1.0,) * settings.strategies)
+    while_unseen = (
+        draws_below(settings.strategy_odds_unseen) if settings.strategy_odds_unseen else usual
+    )
     below = jnp.where(is_seen[..., None], usual, while_unseen)
     return jnp.sum(draw[..., None] >= below, axis=-1, dtype=jnp.int32)
 
 
-def _below(odds):
+def draws_below(odds):
     """(K - 1,) the draws below which the first, the second ... strategy is meant."""
     share = np.cumsum(odds) / np.sum(odds)
     return share[:-1].astype(np.float32)
