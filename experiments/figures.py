@@ -7,19 +7,19 @@ while a page shows anything else.
 """
 
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from experiments.paper.values import means
+from experiments.table import RESULTS, table
 from openjax.command_line import run_command
 from openjax.files import read_json, read_toml, write_text
 from openjax.pursuit import SCENARIOS, PursuitSettings
 from openjax.store import DEFAULT_POLICY
 
 ROOT = Path(__file__).parents[1]
-RESULTS = ROOT / "experiments" / "results"
 LEARNED, PLANNER = "evaders that learn", "a planner"
 """The two judges of a policy that find most."""
 JUDGES = {
@@ -61,12 +61,6 @@ def worst(rate: dict[str, float]) -> float:
     return min(rate[layout] for layout in SCENARIOS)
 
 
-def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def linked(words: str, page: str) -> str:
     """Words that lead to a page of results."""
     return f"[{words}](experiments/results/{page}.md)"
@@ -78,7 +72,7 @@ def judged() -> str:
     for judge, told in JUDGES.items():
         rate = rates(DEFAULT_POLICY, judge)
         rows.append([told, *(f"{rate[place]:.2f}" for place in PLACES)])
-    return table(["hardest evader among", *PLACES], rows)
+    return "\n".join(table(["hardest evader among", *PLACES], rows))
 
 
 def members() -> str:
@@ -201,7 +195,7 @@ def diagnosis() -> list[str]:
 def results() -> str:
     """The README's table."""
     rows = [whole_runs(), first_runs(), *paper_game(), *judged_rows(), slower_vehicle(), forced()]
-    return table(["What was measured", "Result"], [*rows, diagnosis()])
+    return "\n".join(table(["What was measured", "Result"], [*rows, diagnosis()]))
 
 
 def game() -> str:
@@ -215,7 +209,7 @@ def game() -> str:
         f"within {own.capture_radius} m, in {own.episode_length * own.time_step:.0f} s",
         f"thrust and body rates, {1 / own.time_step:.0f} Hz",
     ]
-    return table(["arena", "pursuers", "evader", "capture", "commands"], [row])
+    return "\n".join(table(["arena", "pursuers", "evader", "capture", "commands"], [row]))
 
 
 def address() -> str:

@@ -102,27 +102,13 @@ def of_policy(name: str, seed: int, limit: str, physics: str, episodes: int) -> 
     }
 
 
-def flights_to_keep(options: argparse.Namespace, alike: dict) -> list[dict]:
-    """What stands in the file already of methods that aren't flown anew, if it was
-    flown alike.
-    """
-    path = options.out / "tables.json"
-    if not path.exists() or len(options.methods) == len(LABELS):
-        return []
-    records = read_json(path)
-    same = {name: records.get(name) for name in alike} == alike
-    return [
-        flight for flight in records["flights"] if same and flight["method"] not in options.methods
-    ]
-
-
-def calls_of(options: argparse.Namespace) -> dict[tuple[str, str], list[tuple[str, int]]]:
+def all_calls() -> dict[tuple[str, str], list[tuple[str, int]]]:
     """Policies and seeds by method and condition; heuristics fly without the clamp,
     too: no training chose their speed.
     """
     return {
         (label, condition): seeds_of(label)
-        for label in options.methods
+        for label in LABELS
         for condition in LIMITS
         if condition == "clamp" or METHODS.get(label) in HEURISTICS
     }
@@ -133,8 +119,8 @@ def study(options: argparse.Namespace) -> None:
     start = time.monotonic()
     alike = {"episodes": options.episodes, "physics": options.physics}
     rest = (options.physics, options.episodes)
-    calls = calls_of(options)
-    flights = flights_to_keep(options, alike)
+    calls = all_calls()
+    flights = []
     compiled = {}
     # compiled side by side, and while others fly
     for (label, condition), seeds in calls.items():
@@ -171,9 +157,6 @@ def main(arguments: list[str]) -> int:
     )
     parser.add_argument(
         "--physics", choices=("rigid", "mjx"), default="rigid", help="mjx: the same, slower"
-    )
-    parser.add_argument(
-        "--methods", nargs="+", choices=LABELS, default=list(LABELS), help="fly these anew"
     )
     options = parser.parse_args(arguments)
     if not options.report:

@@ -6,7 +6,6 @@ from experiments.evaders.escapes import Moment, summary
 from experiments.evaders.judge_table import SECOND, rate
 from experiments.evaders.judge_table import rows_of as lines_of
 from experiments.evaders.judged import page, rows_of, vehicle_of
-from experiments.evaders.judged_game import spread
 from experiments.flying.vehicles import SLOWER
 from openjax.commands.exploit_report import remark, verdict
 from openjax.pursuit import PursuitSettings
@@ -71,13 +70,6 @@ def test_the_page_shows_a_short_and_the_whole_budget_of_weights_and_the_planner(
 def test_the_second_judge_is_the_least_over_learners_and_planner():
     cells = dict(lines_of({"records": RECORDS[:4]}, rate))[SECOND]
     assert cells[0].startswith("0.25") and cells[1:] == ["-"] * 6
-
-
-def test_the_beginning_of_an_order_has_of_all_kinds_what_the_whole_has():
-    order = spread([2, 4, 1])
-    assert sorted(order) == list(range(7))
-    # of the first half: one, two, and one of the single
-    assert sorted(np.digitize(order[:4], [2, 6])) == [0, 1, 1, 2]
 
 
 def test_a_team_that_stands_round_the_evader_leaves_a_third_of_the_circle_open():
