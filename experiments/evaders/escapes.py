@@ -3,15 +3,12 @@
 
 Records where everybody is in episodes against a planner, and says of the episodes
 without a capture, second by second, how fast the pursuers fly, how near they are,
-whether they see the evader, and how they stand round it; and of all, what becomes of an
-evader that hasn't been seen for so long. With `--opponent`, a file of `openjax
-exploit`, that evader flies, not a planner. `--only` flies some of the tasks alone, as
-those in which one got away. With `--clock` the time that the pursuers observe
-stands still from then on, and the planner knows it.
+whether they see the evader, and how they stand round it. With `--opponent`, a file of
+`openjax exploit`, that evader flies, not a planner. With `--clock` the time that the
+pursuers observe stands still from then on, and the planner knows it.
 """
 
 import argparse
-import itertools
 import time
 from dataclasses import dataclass
 
@@ -27,12 +24,9 @@ from openjax.evaluation.judges.receding_horizon import RecedingHorizon
 from openjax.evaluation.judges.settings import PlannerSettings
 from openjax.files import write_json
 from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import Observation, PursuitSettings, PursuitState, Task
-from openjax.pursuit.sensing import line_of_sight
+from openjax.pursuit import Observation, PursuitSettings, PursuitState
 from openjax.store.environments import make_environment
 
-AGES = (0.0, 0.1, 0.3, 0.6, 1.1, 2.1)
-"""Seconds for which nobody has seen an evader, from each to the next; 0: it is seen."""
 TIME = slice(16, 20)
 """Where t/T stands in a pursuer's own part of the observation."""
 
@@ -45,7 +39,6 @@ class Moment:
     velocity: jax.Array  # (T, B, N, 3) m/s, the pursuers'
     evader: jax.Array  # (T, B, 3) m
     in_sight: jax.Array  # (T, B, N) bool, who sees the evader
-    last_seen: jax.Array  # (T, B, 3) m, where it is taken to be
     captured: jax.Array  # (T, B) bool, by now
 
 
@@ -77,7 +70,6 @@ def moment(state: PursuitState) -> Moment:
         velocity=drones.velocity,
         evader=state.evader_position,
         in_sight=state.sees,
-        last_seen=state.last_seen,
         captured=state.statistics.captured,
     )
 
@@ -160,68 +152,11 @@ def summary(moments: Moment, game: PursuitSettings, replan: int) -> dict:
     return found | {name: each_second(value, np.mean) for name, value in shares.items()}
 
 
-def age_of_sight(seen: np.ndarray) -> np.ndarray:
-    """(T, B) moments since somebody saw the evader, of (T, B) whether somebody does; it
-    counts as seen before the first.
-    """
-    age = np.zeros(seen.shape, int)
-    for i in range(1, len(seen)):
-        age[i] = np.where(seen[i], 0, age[i - 1] + 1)
-    return np.where(seen, 0, np.maximum(age, 1))
-
-
-def place_in_view(moments: Moment, tasks: Task, game: PursuitSettings) -> np.ndarray:
-    """(T, B) whether somebody sees the place where the evader is taken to be."""
-
-    def one(pursuers, place, task):
-        pillars = task.pillar_position, task.pillar_active
-        return jnp.any(line_of_sight(game, pursuers, place, *pillars))
-
-    of_worlds = jax.vmap(jax.vmap(one), in_axes=(0, 0, None))
-    return np.asarray(jax.jit(of_worlds)(moments.pursuers, moments.last_seen, tasks))
-
-
-def out_of_sight(moments: Moment, in_view: np.ndarray, second: int) -> list[dict[str, float]]:
-    """What becomes of evaders that nobody has seen for so long: a row for each of
-    `AGES`; `in_view` (T, B) whether the place is where they are taken to be, and
-    `second` moments are one.
-    """
-    free = ~moments.captured
-    age = age_of_sight(moments.in_sight.any(-1))
-    speed = np.linalg.norm(moments.velocity, axis=-1).mean(-1)
-    error = np.linalg.norm((moments.last_seen - moments.evader)[..., :2], axis=-1)
-    later_seen = moments.in_sight.any(-1)[1:]
-    caught = moments.captured[1:] & ~moments.captured[:-1]
-    rows = []
-    bounds = [*np.round(np.multiply(AGES, second)), np.inf]
-    for first, (begin, end) in zip(AGES, itertools.pairwise(bounds), strict=True):
-        # with a moment after it
-        own = (free & (age >= begin) & (age < end))[:-1]
-        if not own.any():
-            continue
-        means = {
-            "pursuers_speed": speed[:-1],
-            "place_in_view": in_view[:-1],
-            "place_off_level": error[:-1],
-            "seen_a_moment_later": later_seen,
-        }
-        rows.append(
-            {
-                "unseen_from": first,
-                "seconds": float(own.sum() / second),
-                "captures": int((own & caught).sum()),
-                **{name: float(value[own].mean()) for name, value in means.items()},
-            }
-        )
-    return rows
-
-
 def escapes_parser() -> argparse.ArgumentParser:
     """The options."""
     parser = game_parser(__doc__, episodes=10, uniform=24)
     parser.add_argument("--plans", type=int, default=PlannerSettings().plans)
     parser.add_argument("--clock", type=float, help="seconds after which the observed time stops")
-    parser.add_argument("--only", type=int, nargs="*", help="numbers of each kind's tasks; all")
     parser.add_argument("--opponent", help="file of a learned evader")
     return parser
 
@@ -254,20 +189,14 @@ def main() -> None:
         "plans": None if options.opponent else options.plans,
         "opponent": options.opponent,
         "clock": options.clock,
-        "only": options.only,
         "kinds": {},
     }
     replan = evaders.settings.replan
-    second = round(1.0 / (settings.time_step * replan))
     for kind, tasks in game.part(game.tasks).items():
         began = time.monotonic()
-        if options.only:
-            tasks = jax.tree.map(lambda leaf: leaf[np.array(options.only)], tasks)
         flown = fly(game.loaded.parameters, tasks, jax.random.key(options.seed))
         flown = jax.tree.map(np.asarray, flown)
         own = summary(flown, settings, replan)
-        in_view = place_in_view(flown, tasks, settings)
-        own["out_of_sight"] = out_of_sight(flown, in_view, second)
         found["kinds"][kind] = own
         seconds = time.monotonic() - began
         print(f"{kind}, {seconds:.0f} s: {own['captures']} of {own['episodes']} caught", flush=True)

@@ -3,8 +3,6 @@
 import numpy as np
 
 from experiments.evaders.escapes import Moment, summary
-from experiments.evaders.judge_table import SECOND, rate
-from experiments.evaders.judge_table import rows_of as lines_of
 from experiments.evaders.judged import page, rows_of, vehicle_of
 from experiments.flying.vehicles import SLOWER
 from openjax.commands.exploit_report import remark, verdict
@@ -67,11 +65,6 @@ def test_the_page_shows_a_short_and_the_whole_budget_of_weights_and_the_planner(
     ]
 
 
-def test_the_second_judge_is_the_least_over_learners_and_planner():
-    cells = dict(lines_of({"records": RECORDS[:4]}, rate))[SECOND]
-    assert cells[0].startswith("0.25") and cells[1:] == ["-"] * 6
-
-
 def test_a_team_that_stands_round_the_evader_leaves_a_third_of_the_circle_open():
     """In the first second of the first of two episodes; then all fly beside each other
     above it, and the other episode ends with a capture.
@@ -87,7 +80,6 @@ def test_a_team_that_stands_round_the_evader_leaves_a_third_of_the_circle_open()
         velocity=np.full((20, 2, 3, 3), [0.0, 0.6, 0.8]),
         evader=np.zeros((20, 2, 3)),
         in_sight=np.repeat(~captured[..., None], 3, axis=2),
-        last_seen=np.zeros((20, 2, 3)),
         captured=captured,
     )
     found = summary(moments, PursuitSettings(), replan=10)
