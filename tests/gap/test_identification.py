@@ -162,6 +162,27 @@ def test_the_filter_of_the_gyroscope_is_no_delay_of_the_motors():
         assert fit.value[:2] == pytest.approx([truth.up, truth.down], rel=0.1)
 
 
+@pytest.mark.parametrize("cycles", [2, 4])
+def test_motors_that_are_logged_some_cycles_late_are_not_slow(cycles):
+    """In rows of every cycle a search that begins on the wrong side of the clock ends at
+    twice the lag and half the gain.
+    """
+    (seen,), (motors,) = fly([Truth()], 5.0)
+    late = np.roll(motors, cycles, axis=0)
+    record = record_of("late", seen, late, 500).rows(slice(10, None))
+    fit = identify_torques([record])
+    deviation = np.sqrt(np.diag(fit.covariance))
+    names = dict(zip(NAMES, zip(fit.value, deviation, strict=True), strict=True))
+    for name in ("spin_up", "spin_down"):
+        assert names[name][0] == pytest.approx(0.025, rel=0.06)
+        assert abs(names[name][0] - 0.025) < 1.645 * names[name][1]
+    assert fit.value[3:6] == pytest.approx(1.0, abs=0.05)
+    assert fit.clock == pytest.approx(-0.002 * cycles, abs=0.002)
+    for axis, pair in responses([record], fit).items():
+        if axis in ("roll", "pitch"):
+            assert pair.measured.at(5.0)[0] == pytest.approx(pair.simulated.at(5.0)[0], rel=0.06)
+
+
 def test_no_line_stands_for_motors_that_were_not_logged():
     rng = np.random.default_rng(0)
     time = 0.01 * np.arange(960)

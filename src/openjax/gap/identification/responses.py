@@ -15,11 +15,12 @@ from openjax.flights.track import Track
 from openjax.gap.identification.prediction_errors import Problem, earlier, value_at
 from openjax.gap.identification.regression import solve
 from openjax.gap.identification.rotor_rows import rotor_rows
-from openjax.gap.identification.search import EARLIEST, TorqueFit
+from openjax.gap.identification.search import TorqueFit, earliest
 
 AXES = ("roll", "pitch", "yaw", "thrust")
 FREQUENCIES = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0, 12.0, 15.0])  # Hz
 HIGHEST = 0.3  # of the rows' rate: above, rows say little
+WITHIN = 0.25  # of a row that a clock may be wrong: motors too early would answer noise of rates
 DRAWS = 200  # of the coefficients, for intervals
 LEVEL = (5.0, 50.0, 95.0)  # per cent
 GYROSCOPE = 0.02  # rad/s, noise of the simulated gyroscope
@@ -60,11 +61,15 @@ def responses(records: list[Track], fit: TorqueFit) -> dict[str, Pair]:
     """{axis: pair} of all axes that the records hold. `fit` gives the clock, and what a
     row of means does to its own end, which such rows can't tell from the loop's answer.
     """
-    ahead = max(int(np.ceil((EARLIEST - fit.clock) / records[0].dt)), 0)
+    dt = records[0].dt
+    too_late = earliest(records[0]) - fit.clock
+    ahead = max(int(np.ceil(too_late / dt - WITHIN)), 0)
     problem = Problem([earlier(r, ahead) for r in records])
-    nominal = problem.start
+    nominal = problem.start.copy()
     real = fit.value.copy()
-    real[2] += ahead * problem.dt
+    real[2] += ahead * dt
+    if ahead:  # the rest of the way, which is the clock's and no vehicle's
+        nominal[2] = max(real[2], 0.0)
     pairs = {}
     rng = np.random.default_rng(0)
     errors = problem.errors(nominal)

@@ -20,8 +20,8 @@ LARGEST_ERROR = 2.0  # as a logarithm: nothing is known
 LEAST_LAG = 0.03
 LEAST_GAIN = 0.01
 LEAST_DAMPING = 0.2
-"""Errors of lags and gains, as logarithms, and of damping, 1/s, that such rows leave in
-still air.
+"""Errors of lags and gains, as logarithms, and of damping, 1/s, that rows leave in still
+air: by what they hide, and by stamps that are right to half a cycle.
 """
 SAMPLED_LAG = 0.3
 SAMPLED_GAIN = 0.45
@@ -46,17 +46,15 @@ def hidden_errors(problem: Problem, axes: list) -> np.ndarray:
     """Standard deviations (9,) at a place of the search, of what rows hide."""
     out = np.zeros(len(NAMES))
     out[2] = HALF_CYCLE
+    out[[0, 1]], out[[3, 4, 5]], out[[6, 7]] = LEAST_LAG, LEAST_GAIN, LEAST_DAMPING
     if not problem.records[0].hides_ticks:
         return out
     if any(r.samples for r in problem.records):
-        out[[0, 1]] = SAMPLED_LAG
-        out[[3, 4, 5]] = SAMPLED_GAIN
-        out[[6, 7]] = SAMPLED_DAMPING
+        out[[0, 1]], out[[3, 4, 5]], out[[6, 7]] = SAMPLED_LAG, SAMPLED_GAIN, SAMPLED_DAMPING
         return out
     turns, quick = turning(problem, axes)
     beyond = max(quick[:2].max() ** 2 - 1.0, NOISE_IN_LAG / LARGEST_ERROR)
     out[[0, 1]] = np.hypot(LEAST_LAG, NOISE_IN_LAG / beyond)
     gain = np.minimum(NOISE_IN_GAIN / turns**2, LARGEST_ERROR)
     out[[3, 4, 5]] = np.hypot(LEAST_GAIN, gain)
-    out[[6, 7]] = LEAST_DAMPING
     return out

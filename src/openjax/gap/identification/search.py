@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from openjax.flights.track import Track
 from openjax.gap.identification.prediction_errors import LOGARITHMS, TINY, Problem, value_at
 from openjax.gap.identification.row_errors import hidden_errors, turning
 
@@ -136,10 +137,15 @@ def _step(problem: Problem, value: np.ndarray, axes: list) -> np.ndarray:
     return step / max(np.abs(step / LARGEST_STEP).max(), 1.0)
 
 
+def earliest(record: Track) -> float:
+    """The delay (s) below which nothing is looked for: motors act after their command."""
+    return EARLIEST if record.hides_ticks else 0.0
+
+
 def _clip(problem: Problem, value: np.ndarray) -> np.ndarray:
     out = value.copy()
     out[:2] = np.clip(out[:2], *np.log(SEARCHED[0]))
-    out[2] = max(out[2], EARLIEST if problem.records[0].hides_ticks else 0.0)
+    out[2] = max(out[2], earliest(problem.records[0]))
     out[3:6] = np.clip(out[3:6], *np.log(SEARCHED[1]))
     return out
 

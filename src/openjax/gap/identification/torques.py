@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
-from openjax.flights.track import Track
+from openjax.flights.track import LOOP_ROWS, Track
 from openjax.gap.identification.prediction_errors import Problem, earlier
+from openjax.gap.identification.row_errors import HALF_CYCLE
 from openjax.gap.identification.search import TorqueFit, begin, search
 
 FAST_ROWS = 0.005  # s: slower rows show 2 ms of delay in its place
 AHEAD = (0.01, 0.02, 0.04, 0.08)  # s by which motors are tried earlier than logged
+CYCLES = (0.006, 0.012)  # s: three cycles of the rate loop, and six
 LATE = (0.002, 0.03)  # s, starts of the delay
 # of the nominal gain; the heaviest decks and duty cycles leave about as much
 STRONG = 0.45
@@ -20,25 +22,41 @@ def identify_torques(records: list[Track], one_clock: bool = True) -> TorqueFit:
     where streams share no `one_clock`, none is looked for.
     """
     base = Problem(records)
-    first = search(base, begin(base, LATE[0]))
+    first = _first_fit(base)
     if base.dt < FAST_ROWS:
         # Whether such rows are of the filtered gyroscope nobody says, but they show it.
         low_pass_problem = Problem(records, low_pass=True)
-        other = search(low_pass_problem, begin(low_pass_problem, LATE[0]))
+        other = _first_fit(low_pass_problem)
         if other.loss < first.loss - CLEARLY:
             base, first = low_pass_problem, other
     if _clear(first) or not one_clock:
         return first
     fits = [first, search(base, begin(base, LATE[1]))]
-    for rows in {round(ahead / base.dt): None for ahead in AHEAD}:
-        if rows:
-            problem = Problem([earlier(r, rows) for r in records], base.low_pass)
-            fit = search(problem, begin(problem, LATE[0]))
-            value = fit.value.copy()
-            value[2] -= rows * base.dt
-            loss = _comparable(fit.loss, problem, base) + CLEARLY
-            fits.append(replace(fit, value=value, loss=loss))
+    fits += [_earlier_fit(base, rows) for rows in {round(s / base.dt): None for s in AHEAD} if rows]
     return min(fits, key=lambda f: f.loss)
+
+
+def _first_fit(base: Problem) -> TorqueFit:
+    """The fit from a usual delay. Where rows show each cycle of the rate loop, motors that
+    were logged some cycles too late hold the search in a place with slow and weak ones, so
+    it begins before them as well, and earlier still where it ends at its beginning.
+    """
+    fits = [search(base, begin(base, LATE[0]))]
+    if base.dt <= LOOP_ROWS:
+        for cycles in CYCLES:
+            fits.append(_earlier_fit(base, round(cycles / base.dt)))
+            if fits[-1].clock > HALF_CYCLE - cycles:
+                break
+    return min(fits, key=lambda f: f.loss)
+
+
+def _earlier_fit(base: Problem, rows: int) -> TorqueFit:
+    """The fit with motors so many rows earlier than logged."""
+    problem = Problem([earlier(r, rows) for r in base.records], base.low_pass)
+    fit = search(problem, begin(problem, LATE[0]))
+    value = fit.value.copy()
+    value[2] -= rows * base.dt
+    return replace(fit, value=value, loss=_comparable(fit.loss, problem, base) + CLEARLY)
 
 
 def _comparable(loss: float, problem: Problem, base: Problem) -> float:
