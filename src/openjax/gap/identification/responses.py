@@ -15,12 +15,12 @@ from openjax.flights.track import Track
 from openjax.gap.identification.prediction_errors import Problem, earlier, value_at
 from openjax.gap.identification.regression import solve
 from openjax.gap.identification.rotor_rows import rotor_rows
+from openjax.gap.identification.row_errors import HALF_CYCLE
 from openjax.gap.identification.search import TorqueFit, earliest
 
 AXES = ("roll", "pitch", "yaw", "thrust")
 FREQUENCIES = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0, 12.0, 15.0])  # Hz
 HIGHEST = 0.3  # of the rows' rate: above, rows say little
-WITHIN = 0.25  # of a row that a clock may be wrong: motors too early would answer noise of rates
 DRAWS = 200  # of the coefficients, for intervals
 LEVEL = (5.0, 50.0, 95.0)  # per cent
 GYROSCOPE = 0.02  # rad/s, noise of the simulated gyroscope
@@ -63,7 +63,8 @@ def responses(records: list[Track], fit: TorqueFit) -> dict[str, Pair]:
     """
     dt = records[0].dt
     too_late = earliest(records[0]) - fit.clock
-    ahead = max(int(np.ceil(too_late / dt - WITHIN)), 0)
+    # motors that come earlier than need be would answer the noise of rates
+    ahead = max(int(np.ceil((too_late - 0.5 * HALF_CYCLE) / dt)), 0)
     problem = Problem([earlier(r, ahead) for r in records])
     nominal = problem.start.copy()
     real = fit.value.copy()

@@ -8,8 +8,7 @@ from openjax.gap.identification.row_errors import HALF_CYCLE
 from openjax.gap.identification.search import TorqueFit, begin, search
 
 FAST_ROWS = 0.005  # s: slower rows show 2 ms of delay in its place
-AHEAD = (0.01, 0.02, 0.04, 0.08)  # s by which motors are tried earlier than logged
-CYCLES = (0.006, 0.012)  # s: three cycles of the rate loop, and six
+AHEAD = (0.006, 0.012, 0.02, 0.04, 0.08)  # s by which motors are tried earlier than logged
 LATE = (0.002, 0.03)  # s, starts of the delay
 # of the nominal gain; the heaviest decks and duty cycles leave about as much
 STRONG = 0.45
@@ -43,7 +42,7 @@ def _first_fit(base: Problem) -> TorqueFit:
     """
     fits = [search(base, begin(base, LATE[0]))]
     if base.dt <= LOOP_ROWS:
-        for cycles in CYCLES:
+        for cycles in AHEAD[:2]:
             fits.append(_earlier_fit(base, round(cycles / base.dt)))
             if fits[-1].clock > HALF_CYCLE - cycles:
                 break
