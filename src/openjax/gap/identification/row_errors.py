@@ -46,11 +46,15 @@ def hidden_errors(problem: Problem, axes: list) -> np.ndarray:
     """Standard deviations (9,) at a place of the search, of what rows hide."""
     out = np.zeros(len(NAMES))
     out[2] = HALF_CYCLE
-    out[[0, 1]], out[[3, 4, 5]], out[[6, 7]] = LEAST_LAG, LEAST_GAIN, LEAST_DAMPING
+    out[[0, 1]] = LEAST_LAG
+    out[[3, 4, 5]] = LEAST_GAIN
+    out[[6, 7]] = LEAST_DAMPING
     if not problem.records[0].hides_ticks:
         return out
     if any(r.samples for r in problem.records):
-        out[[0, 1]], out[[3, 4, 5]], out[[6, 7]] = SAMPLED_LAG, SAMPLED_GAIN, SAMPLED_DAMPING
+        out[[0, 1]] = SAMPLED_LAG
+        out[[3, 4, 5]] = SAMPLED_GAIN
+        out[[6, 7]] = SAMPLED_DAMPING
         return out
     turns, quick = turning(problem, axes)
     beyond = max(quick[:2].max() ** 2 - 1.0, NOISE_IN_LAG / LARGEST_ERROR)
