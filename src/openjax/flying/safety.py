@@ -166,7 +166,7 @@ def _trouble(state, drone, sample) -> tuple[Mode, str] | None:
 
 
 def _loss(state, drone, sample) -> str:
-    """Why no pose tells where the drone is; empty if one does."""
+    """The reason that no pose tells where the drone is; empty if one does."""
     if state.time - sample.last_contact > state.settings.link_timeout:
         return "link gone"
     if state.time - drone.seen > state.settings.pose_timeout:
@@ -175,7 +175,7 @@ def _loss(state, drone, sample) -> str:
 
 
 def _unfit(state, drone) -> str:
-    """Why a drone whose pose is known mustn't fly on; empty if it may."""
+    """The reason that a drone whose pose is known mustn't fly on; empty if it may."""
     settings = state.settings
     time = state.time
     if drone.low_since is not None and time - drone.low_since > settings.battery_time:

@@ -73,7 +73,7 @@ def matters(gaps: Gaps, least: float = DECISION.least_gap):
 
 
 def worse(gain, error, gaps: Gaps, beside: Gaps):
-    """Whether a set is clearly worse than the best: by so many nats `gain` with their
+    """True if a set is clearly worse than the best: by so many nats `gain` with their
     standard `error`, and so that it matters.
 
     Nuisances take a part of what an effect does, as a wrong moment of inertia looks
@@ -91,7 +91,7 @@ def log_odds(effects) -> float:
 
 
 def practical(fit: SetFit) -> bool:
-    """Whether every effect of a set is clearly of a size that matters in practice."""
+    """True if every effect of a set is clearly of a size that matters in practice."""
     return not too_small(fit)
 
 
@@ -129,7 +129,7 @@ def clearly_larger(
     covariance: Float[np.ndarray, "own own"],
     least: Float[np.ndarray, " own"],
 ) -> bool:
-    """Whether parameters that are `away` (p,) from doing nothing are further than
+    """True if parameters that are `away` (p,) from doing nothing are further than
     `least` (p,), either one of them by its 90 % interval, or all together by as much of
     their size as their common 90 % region leaves: of two that only their sum is known
     of, neither need be clear by itself.
@@ -147,7 +147,7 @@ def departs(
     covariance: Float[np.ndarray, "own own"],
     departure: Float[np.ndarray, "states own"],
 ) -> bool:
-    """Whether parameters that are `away` (p,) from doing nothing do clearly more than
+    """True if parameters that are `away` (p,) from doing nothing do clearly more than
     what begins to matter: what they do, less as much of it as its 90 % region leaves,
     is above 1 (see `Card.departure`).
     """
@@ -161,7 +161,7 @@ def departs(
 
 
 def possible(fit: SetFit) -> bool:
-    """Whether all fitted parameters lie within physical bounds."""
+    """True if all fitted parameters lie within physical bounds."""
     return not beyond_bounds(fit)
 
 
@@ -171,7 +171,7 @@ def beyond_bounds(fit: SetFit) -> frozenset[str]:
 
 
 def within_bounds(fit: SetFit, effect: str) -> bool:
-    """Whether the parameters of one effect do."""
+    """True if the parameters of one effect do."""
     estimates = fit.parameters()[effect]
     values = {p: value for p, (value, _) in estimates.items()}
     deviations = {p: deviation for p, (_, deviation) in estimates.items()}

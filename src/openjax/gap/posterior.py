@@ -1,4 +1,4 @@
-"""Which causes explain what was measured: a linear model with normal errors, weighed
+"""Causes that explain what was measured: a linear model with normal errors, weighed
 exactly for every small set of causes.
 
 Quantities differ from what is assumed by q = A theta + e, with sizes theta ~ N(0, P) of
@@ -34,7 +34,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """What a cause does to quantities, and how large it usually is."""
+    """A cause: its effect on quantities, and its usual size."""
 
     name: str
     loads: Float[np.ndarray, "quantities sizes"]

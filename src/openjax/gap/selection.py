@@ -1,4 +1,4 @@
-"""Which physics effects act: all small sets weighed by the model linearised, the best
+"""The choice of physics effects that act: all small sets weighed by the model linearised, the best
 of them fitted, then the most plausible set that isn't clearly worse.
 
 The score of a set of effects is its log predictive density on stretches left out
@@ -287,7 +287,7 @@ class Search:
             self.trims_of(hypothesis)
 
     def trims_of(self, hypothesis: Hypothesis) -> Hypothesis:
-        """What a hypothesis holds of a vehicle's trims and of what others named: with
+        """The part of a hypothesis that is a vehicle's trims and of what others named: with
         these alone a real vehicle is as a simulated one is without.
         """
         trims = {e for e in hypothesis.effects if e in TRIMS}
@@ -323,7 +323,7 @@ class Search:
         return max(self.candidates, key=lambda h: h.score)
 
     def clearly_worse(self, other: Hypothesis, best: Hypothesis) -> bool:
-        """Whether flights tell a hypothesis from the best one, and it leaves a gap so
+        """True if flights tell a hypothesis from the best one, and it leaves a gap so
         much larger that it matters.
         """
         gain, error, _ = difference(best.validation, other.validation)

@@ -217,7 +217,7 @@ class Loop:
         self.progress.update(update * self.plan.steps_per_update, values)
 
     def _decide(self):
-        """Why to stop, and whether a checkpoint is late: a signal to any process
+        """The reason to stop, and whether a checkpoint is late: a signal to any process
         counts, and the first one's clock.
         """
         checkpoint_due = time.monotonic() - self.saved_at > self.plan.checkpoint_seconds

@@ -1,4 +1,4 @@
-"""How the torques of a case answer beside those of the same vehicle's reference flights.
+"""The torques of a case beside those of the same vehicle's reference flights.
 
 What rows hide, and what a gyroscope's filter or a loop's noise makes of a response, is
 the same in both, so a change shows where the response itself can't be told.
@@ -33,7 +33,7 @@ LAGS = ("extra_up", "extra_down")
 
 
 def comparable(case: Identification | None, reference: Identification | None) -> bool:
-    """Whether the responses of two sets of flights have the same errors of their rows,
+    """True if the responses of two sets of flights have the same errors of their rows,
     or none that matter.
     """
     if case is None or reference is None:

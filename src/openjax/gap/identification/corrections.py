@@ -1,4 +1,4 @@
-"""What the simulator that trains should take from an identification."""
+"""Corrections that the simulator that trains should take from an identification."""
 
 from dataclasses import dataclass
 

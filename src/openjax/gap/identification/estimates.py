@@ -1,4 +1,4 @@
-"""What an identification says in the diagnosis' words: values of effects with their
+"""An identification in the diagnosis' words: values of effects with their
 covariance.
 """
 
@@ -45,7 +45,7 @@ GAINS = TORQUES[1:]  # which a replay of the motion doesn't tell: it gives up fe
 
 
 def of_fit(fit: TorqueFit, vehicle) -> EffectEstimates:
-    """What a fit of the torques says of motor lag, inertia and yaw torque, with nothing
+    """Estimates, by a fit of the torques, of motor lag, inertia and yaw torque, with nothing
     taken for granted of the loop around them.
 
     A slow motor and a large inertia both weaken the response, and only the lag turns

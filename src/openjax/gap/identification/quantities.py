@@ -1,4 +1,4 @@
-"""What flights say of a vehicle: numbers beside the simulator's, and responses."""
+"""A vehicle as its flights show it: numbers beside the simulator's, and responses."""
 
 from dataclasses import asdict, dataclass
 
@@ -34,7 +34,7 @@ MATTERS = {"motor_lag": 0.006, "inertia": 0.15, "yaw_torque": 0.2}
 
 @dataclass(frozen=True)
 class Kind:
-    """What a number is in words, the effect to which it belongs, and its unit."""
+    """A number in words, the effect to which it belongs, and its unit."""
 
     words: str
     effect: str = ""
@@ -63,7 +63,7 @@ KINDS = {
 
 
 def words_of(name: str) -> str:
-    """What a number is called: one of `KINDS`, or "effect.parameter"."""
+    """The name of a number in words: one of `KINDS`, or "effect.parameter"."""
     return KINDS[name].words if name in KINDS else name.replace(".", " ").replace("_", " ")
 
 
@@ -83,12 +83,12 @@ class Quantity:
 
     @property
     def differs(self) -> bool:
-        """Whether the interval leaves the simulator's value out."""
+        """True if the interval leaves the simulator's value out."""
         return not self.interval90[0] <= self.simulator <= self.interval90[1]
 
     @property
     def departs(self) -> bool:
-        """Whether a positive number differs from the simulator's by three standard
+        """True if a positive number differs from the simulator's by three standard
         deviations, and by as much as training should know.
         """
         least = MATTERS.get(self.effect)
@@ -151,7 +151,7 @@ class Identification:
         }
 
     def sentence(self) -> str:
-        """What the vehicle does, in one sentence."""
+        """The answer of the vehicle, in one sentence."""
         if not self.trustworthy:
             return f"How torques answer can't be told from these logs: {self.remarks[0]}."
         ratio, lead = self.at(TALKED_OF)
@@ -201,7 +201,7 @@ class Identification:
 
 
 def identify(case: Case, one_clock: bool = True, gain_error: float = 0.0) -> Identification | None:
-    """What the flights of a case say of the vehicle; None where none has motors and
+    """Identify the vehicle of a case by its flights; None where none has motors and
     body rates. Without `one_clock` streams were found to be apart by times that wander:
     what is said of torques then isn't trusted. `gain_error`: standard deviation of the
     gyroscope's gain.
@@ -273,7 +273,7 @@ def _quantity(name: str, value: float, deviation: float, simulator: float) -> Qu
 
 
 def doubts(records: list[Track], fit: TorqueFit, one_clock: bool) -> tuple[str, ...]:
-    """Why what is said of torques isn't to be trusted."""
+    """Reasons not to trust what is said of torques."""
     reasons = []
     if not one_clock:
         reasons.append("the streams of motors and sensors are apart by times that wander")

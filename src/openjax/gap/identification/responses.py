@@ -1,4 +1,4 @@
-"""What motors do to a vehicle, frequency by frequency, without a model of it.
+"""Frequency responses of a vehicle to its motors, without a model of it.
 
 A high-order ARX fit of body rates (or of the force along body z) on the whole motor
 signal in closed loop: Ljung, System Identification, chapters 4 and 13. Torques are

@@ -1,5 +1,5 @@
-"""What rows hide of a rate loop that runs several times within them, as errors of the
-parameters.
+"""Errors of the parameters by what rows hide of a rate loop that runs several times within
+them.
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ of simulated flights in calm and gusty air, `experiments/results/identification.
 
 
 def turning(problem: Problem, axes: list) -> tuple[np.ndarray, np.ndarray]:
-    """What each axis (3,) turns, and what it turns within QUICK, in standard deviations
+    """Turning of each axis (3,), and its turning within QUICK, in standard deviations
     of its noise.
     """
     noise = np.array([e.var() for e, _, _ in axes]) + TINY

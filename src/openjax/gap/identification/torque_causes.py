@@ -39,7 +39,7 @@ DRAWS = np.random.default_rng(0).standard_normal((256, 3))
 
 @dataclass(frozen=True, eq=False)
 class Torques:
-    """What the torques tell: `estimate` of NAMES beside the vehicle that has
+    """The `estimate` of NAMES beside the vehicle that has
     `nominal` (P,), whose motors' time constants are `lags` (2,), s.
     """
 
@@ -215,7 +215,7 @@ def usual_shift(effect: str, lags: np.ndarray) -> np.ndarray:
 def torques_of(
     identification: Identification | None, baseline, vehicle, pwm: bool, absent: np.ndarray
 ) -> Torques | None:
-    """What the torques of a case tell beside the vehicle that has `absent` (P,) while
+    """Torques of a case beside the vehicle that has `absent` (P,) while
     nothing acts; None where they aren't trusted. Beside a `baseline` it is what changed
     since, so that what both sets of flights hide or have alike drops out.
     """

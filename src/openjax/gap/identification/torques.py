@@ -64,7 +64,7 @@ def _comparable(loss: float, problem: Problem, base: Problem) -> float:
 
 
 def _clear(fit: TorqueFit) -> bool:
-    """Whether roll and pitch answer as strongly and as soon as those of any such
+    """True if roll and pitch answer as strongly and as soon as those of any such
     vehicle: then the rows' clock is right to a few milliseconds, and no other need be
     tried.
     """

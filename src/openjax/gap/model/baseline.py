@@ -47,7 +47,7 @@ class Baseline:
 
     @property
     def numbers(self) -> tuple[tuple[str, str, float], ...]:
-        """What is known of the vehicle, as `library.numbers_of` has it, in units of the
+        """The knowledge of the vehicle, as `library.numbers_of` has it, in units of the
         parameter.
         """
         return tuple((*name.split(" "), 1.0) for name in self.names)

@@ -1,4 +1,4 @@
-"""What a model of a table's columns is worth: fitted to all blocks but one, judged on
+"""The worth of a model of a table's columns: fitted to all blocks but one, judged on
 that one.
 """
 

@@ -1,4 +1,4 @@
-"""How each effect of `openjax.vehicle.effects` is fitted: which parameters, where to
+"""The fit of each effect of `openjax.vehicle.effects`: which parameters, where to
 start, what is plausible.
 
 Priors are weak: their spread is of the order of the effect's usual range.

@@ -45,7 +45,7 @@ LATER = 4.0  # nats by which one of these must be better than a wake at once
 
 @dataclass(frozen=True, eq=False)
 class Gusts:
-    """What a case shows of gusts under other vehicles."""
+    """Gusts under other vehicles, as a case shows them."""
 
     rows: tuple[Bool[np.ndarray, " _"], ...]
     """(T,) of each track: under another vehicle, or just before."""
@@ -57,7 +57,7 @@ class Gusts:
     """For a wake; 0 where nothing is clear."""
 
     def in_words(self) -> str:
-        """What was found, as a sentence."""
+        """The finding, as a sentence."""
         most = max(self.louder.values()) ** 0.5
         return (
             f"under another vehicle motion is {most:.1f} times as uneven as elsewhere: its wake is "

@@ -31,7 +31,7 @@ from openjax.gap.trims.weigh import least_shown, weigh
 
 
 def compare(flights: LogFolder, references: Sequence[LogFolder]) -> Change:
-    """What changed in the flights of a folder against those of one or more reference
+    """Find what changed in the flights of a folder against those of one or more reference
     folders (days).
 
     Raises UserError for flights of several vehicles, and of that TooLittle for a folder

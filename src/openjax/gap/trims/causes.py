@@ -1,4 +1,4 @@
-"""What a cause would do to a flight's trims: draws of its size, its place and how well
+"""Effects of a cause on a flight's trims: draws of its size, its place and how well
 real changes follow its pattern.
 
     one rotor weaker by a share e   hover, roll, pitch and yaw move alike, with the signs
@@ -25,7 +25,7 @@ from openjax.gap.trims.figures import PLACES, TRIMS
 
 @dataclass(frozen=True)
 class Cause:
-    """What may have changed, how probable it is if something did, and the effects of
+    """A possible change, how probable it is if something did, and the effects of
     the library that it is.
     """
 

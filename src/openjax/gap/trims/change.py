@@ -1,4 +1,4 @@
-"""What differs between the trims of two sets of flights, as plain data and in words."""
+"""Differences between the trims of two sets of flights, as plain data and in words."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Change:
-    """What differs between two sets of flights.
+    """Differences between two sets of flights.
 
     `probability` that the vehicle changed. `places` {rotors: p} and `causes` {cause: p}
     say how probable each is if it did (`causes_here`: at the most probable place);
@@ -52,7 +52,7 @@ class Change:
 
     @property
     def charge_unknown(self) -> bool:
-        """Whether a battery's charge may differ unseen: duty cycles without a
+        """True if a battery's charge may differ unseen: duty cycles without a
         voltage.
         """
         return any(f.duty and f.voltage is None for f in (*self.reference, *self.flights))
@@ -73,12 +73,12 @@ class Change:
 
     @property
     def trims_changed(self) -> bool:
-        """Whether the most probable cause moves the trims."""
+        """True if the most probable cause moves the trims."""
         return self.changed and not CAUSES[self.likely_causes[0]].figures
 
     @property
     def trims_differ(self) -> bool:
-        """Whether a trim differs by more than days do, whatever the cause."""
+        """True if a trim differs by more than days do, whatever the cause."""
         return any(
             not self.figures[name].low <= 0.0 <= self.figures[name].high
             for name in TRIMS
@@ -87,7 +87,7 @@ class Change:
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """What changed by the names of the effect library, the most probable first."""
+        """Changes by the names of the effect library, the most probable first."""
         if not self.changed:
             return ()
         effects = (e for c in self.likely_causes for e in CAUSES[c].effects)
@@ -105,7 +105,7 @@ class Change:
 
     @property
     def notes(self) -> list[str]:
-        """What was found in the logs that were used."""
+        """Findings in the logs that were used."""
         return [f"{i.flight}: {i.issue}" for i in self.quality if not i.refused]
 
     def in_words(self) -> list[str]:
@@ -120,7 +120,7 @@ class Change:
         return lines
 
     def measured_in_words(self) -> list[str]:
-        """How large the change is, and the differences behind it."""
+        """The size of the change, and the differences behind it."""
         lines = []
         if self.trims_changed:
             value, low, high = (100 * v for v in (self.size.value, self.size.low, self.size.high))
@@ -142,7 +142,7 @@ class Change:
         return lines + self.differences_in_words()
 
     def sentence(self) -> str:
-        """Whether something changed, and by which cause."""
+        """The change and its cause, if there is one."""
         chance = f"{self.probability:.2f}"
         if not self.changed:
             return (

@@ -65,7 +65,7 @@ class Days:
 
 @dataclass(frozen=True)
 class Battery:
-    """How hover follows the voltage."""
+    """Dependence of hover on the voltage."""
 
     # V, at which hover is compared: the mean of all flights that logged it
     voltage: float
@@ -74,7 +74,7 @@ class Battery:
 
 
 def battery_of(figures: Sequence[FlightFigures]) -> Battery:
-    """How hover follows the battery's voltage: flights of a day against each other,
+    """Dependence of hover on the battery's voltage: flights of a day against each other,
     since neither the day nor a change can enter there.
     """
     mean, sigma = VOLTAGE_SLOPE

@@ -30,7 +30,7 @@ SLOW = 0.015  # s, rows from which on these don't show
 
 @dataclass(frozen=True)
 class Figure:
-    """What a figure is in words, its unit and the factor to it (0: a logarithm, told as
+    """A figure in words, its unit and the factor to it (0: a logarithm, told as
     a change in per cent), and its standard deviations over a vehicle's normal days and
     over flights within a day.
     """
@@ -171,7 +171,7 @@ def _specific_thrust(flight: Flight) -> np.ndarray:
 
 
 def _rate_loop(flight: Flight, mixer: np.ndarray) -> dict:
-    """How late torques follow the motors, and how strongly the rate loop answers."""
+    """The delay of torques after the motors, and how strongly the rate loop answers."""
     grid = clock_of(flight)
     has_rates = flight.body_rates is not None and not flight.body_rates_derived
     if grid is None or len(grid) < 4 * RATE or not has_rates:
@@ -205,7 +205,7 @@ def _lag(torque, rates) -> dict:
 
 
 def _loop(torque, rates, commands) -> dict:
-    """How strongly the rate loop answers a rate error, beside what it answers to a
+    """The strength of the rate loop's answer to a rate error, beside what it answers to a
     change of the rates, by quarters of the flight. In closed loop noise is in all
     three, so the commands are the instruments (two-stage least squares).
     """
