@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from openjax.flights.track import LOOP_ROWS, Track
+from openjax.flights.track import Track
 from openjax.gap.identification.prediction_errors import Problem, earlier
 from openjax.gap.identification.row_errors import HALF_CYCLE
 from openjax.gap.identification.search import TorqueFit, begin, search
@@ -41,7 +41,7 @@ def _first_fit(base: Problem) -> TorqueFit:
     it begins before them as well, and earlier still where it ends at its beginning.
     """
     fits = [search(base, begin(base, LATE[0]))]
-    if base.dt <= LOOP_ROWS:
+    if not base.records[0].hides_ticks:
         for cycles in AHEAD[:2]:
             fits.append(_earlier_fit(base, round(cycles / base.dt)))
             if fits[-1].clock > HALF_CYCLE - cycles:
