@@ -21,12 +21,13 @@ from hypothesis import strategies as st
 from openjax.errors import UserError
 from openjax.flying.board import Board, Role
 from openjax.flying.controller import nominal_airframe
+from openjax.flying.course import FlightPlan
 from openjax.flying.crtp import Supervisor
 from openjax.flying.estimation import see
 from openjax.flying.flight_record import FlightRecord
 from openjax.flying.game import Play
 from openjax.flying.links import Links
-from openjax.flying.loop import FlightLoop, FlightPlan, flight_state
+from openjax.flying.loop import FlightLoop, flight_state
 from openjax.flying.motion_capture import MotionCaptured
 from openjax.flying.raw_links import RawLinks
 from openjax.flying.recorder import NewCase, Recorder
@@ -184,7 +185,7 @@ def test_a_flight_from_the_floor_to_its_log(uris, tmp_path):
     assert flight.record.games[0].capture_step == 11
     timing = flight.record.timing()
     assert timing["ticks"] > 200
-    assert not any(d.contradiction for d in flight.state.drones)
+    assert not any(d.own.fault for d in flight.state.drones)
     # a set-point leaves after the poses that it was made of, and those were measured
     # before they arrived
     assert 0.0 < timing["command_age_ms"]["p50"] < timing["measured_to_sent_ms"]["p50"] < 10.0

@@ -64,13 +64,17 @@ def test_who_drifts_lands_with_the_team(flights):
     state = pursuing()
     for row in range(5):
         state = see(state, 0.01 * row, event(0.01 * row + 1e-3).samples)
-    assert state.drones[0].innovations.pose is not None
+    assert state.drones[0].own.innovations.pose is not None
     usual = Drift(squares=1e-4, age=9.0)
     far = Drift(totals=(0.4, 0.0), squares=1e-4, age=9.0)
     drones = tuple(
-        drone._replace(innovations=drone.innovations._replace(drift=far if i == 0 else usual))
+        drone._replace(
+            own=drone.own._replace(
+                innovations=drone.own.innovations._replace(drift=far if i == 0 else usual)
+            )
+        )
         for i, drone in enumerate(state.drones)
     )
     state = see(state._replace(drones=drones), 0.05, event(0.051).samples)
-    assert [drone.contradiction for drone in state.drones] == [Verdict.DRIFTS, "", ""]
+    assert [drone.own.fault for drone in state.drones] == [Verdict.DRIFTS, "", ""]
     assert state.drones[0].estimate.velocity[0] == pytest.approx(-0.4, abs=0.02)

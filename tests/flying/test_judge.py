@@ -10,7 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from openjax.flying.controller import Pose, moved_on, nominal_airframe
-from openjax.flying.judge import PoseHistory, Verdict, agree, follows, judge
+from openjax.flying.judge import Verdict, judge, offset_of
+from openjax.flying.set_point import MOTORS_OFF
+from openjax.flying.sources import Moment, Source
 from openjax.flying.state import initial_state
 
 LIMITS = initial_state([], airframe=nominal_airframe()).limits
@@ -102,43 +104,41 @@ def test_what_a_vehicle_can_do_is_believed(push, spin, dt):
     )
 
 
+def moment(time, moving=True):
+    return Moment(time, LIMITS, nominal_airframe(), MOTORS_OFF, moving, airborne=False)
+
+
 def test_poses_out_of_order_late_or_from_the_future_change_nothing():
-    track = PoseHistory(HERE._replace(time=1.0))
+    source = Source(HERE._replace(time=1.0))
     for time in (0.99, 1.0, 0.5, 1.2, math.nan, math.inf):
-        assert (
-            track.update(
-                HERE._replace(time=time, position=(0.401, 0.0, 0.5)), 1.01, LIMITS, True, None
-            )
-            is track
-        )
-    assert PoseHistory().update(None, 1.0, LIMITS, True, None) == PoseHistory()
+        pose = HERE._replace(time=time, position=(0.401, 0.0, 0.5))
+        assert source.update(pose, moment(1.01), None) is source
+    assert Source().update(None, moment(1.0), None) == Source()
 
 
 def test_a_refused_pose_leaves_the_last_good_one():
     wrong = HERE._replace(time=0.01, position=(2.0, 0.0, 0.5))
-    assert PoseHistory(HERE).update(wrong, 0.01, LIMITS, True, None) == PoseHistory(
-        HERE, Verdict.JUMPED, 0.01
-    )
-    assert (
-        PoseHistory(HERE).update(wrong, 0.01, LIMITS, False, None).pose is wrong
-    )  # carried to another place by hand
+    refused = Source(HERE).update(wrong, moment(0.01), None)
+    assert refused == Source(HERE, Verdict.JUMPED, 0.01)
+    # carried to another place by hand
+    assert Source(HERE).update(wrong, moment(0.01, moving=False), None).pose is wrong
 
 
 def test_agreement_is_of_place_and_attitude_at_one_time():
     fast = replace_velocity(HERE, (2.0, 0.0, 0.0))
-    later = moved_on(fast, 0.05)
-    assert agree(fast, later, LIMITS) is Verdict.GOOD
-    assert agree(HERE, HERE._replace(position=(0.55, 0.0, 0.5)), LIMITS) is Verdict.APART
-    assert agree(HERE, HERE._replace(quaternion=turned(math.pi)), LIMITS) is Verdict.APART
+    assert offset_of(fast, moved_on(fast, 0.05)).is_agreement(LIMITS)
+    aside = offset_of(HERE, HERE._replace(position=(0.55, 0.0, 0.5)))
+    turned_away = offset_of(HERE, HERE._replace(quaternion=turned(math.pi)))
+    assert not aside.is_agreement(LIMITS) and not turned_away.is_agreement(LIMITS)
     scaled = replace(LIMITS, apart=0.05)
-    assert agree(HERE, HERE._replace(position=(0.48, 0.0, 0.5)), scaled) is Verdict.APART
+    assert not offset_of(HERE, HERE._replace(position=(0.48, 0.0, 0.5))).is_agreement(scaled)
 
 
 def test_the_estimator_on_board_isnt_told_what_it_cant_have_missed():
     near, far = (HERE._replace(position=(0.4 + d, 0.0, 0.5)) for d in (0.02, 0.06))
-    assert follows(HERE, near, LIMITS) and not follows(HERE, far, LIMITS)
-    assert agree(far, HERE, LIMITS) is Verdict.GOOD  # it is flown by all the same
-    assert follows(HERE, moved_on(HERE, 0.2), LIMITS)
+    assert offset_of(HERE, near).is_error(LIMITS) and not offset_of(HERE, far).is_error(LIMITS)
+    assert offset_of(far, HERE).is_agreement(LIMITS)  # it is flown by all the same
+    assert offset_of(HERE, moved_on(HERE, 0.2)).is_error(LIMITS)
 
 
 def replace_velocity(pose, velocity):

@@ -12,9 +12,10 @@ import pytest
 
 from openjax.flying import ticks
 from openjax.flying.controller import GRAVITY, Pose, nominal_airframe
+from openjax.flying.course import FlightPlan
 from openjax.flying.flight_record import FlightRecord
 from openjax.flying.game import Play
-from openjax.flying.loop import FlightLoop, FlightPlan, flight_state
+from openjax.flying.loop import FlightLoop, flight_state
 from openjax.flying.state import Mode, PoseSample, SafetySettings
 from openjax.flying.ticks import PATIENCE, await_poses
 

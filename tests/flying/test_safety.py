@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from openjax.flying.board import Board, Role
 from openjax.flying.controller import Pose, accelerate, nominal_airframe, roll_pitch_yaw
-from openjax.flying.judge import PoseHistory
 from openjax.flying.limits import fence_velocity, parting_velocity, resting_places, stopping_point
 from openjax.flying.safety import step
 from openjax.flying.set_point import OFF, RATES, SetPoint, from_action
+from openjax.flying.sources import Source
 from openjax.flying.state import (
     Drone,
     Event,
@@ -44,7 +44,7 @@ def pursuing(velocity=(0.0, 0.0, 0.0)):
     state = initial_state(PLACES)
     poses = [Pose(0.0, p, velocity, LEVEL) for p in PLACES]
     drones = tuple(
-        Drone(Mode.PURSUIT, estimate=p, own=PoseHistory(p), seen=0.0, sent=POLICY) for p in poses
+        Drone(Mode.PURSUIT, estimate=p, own=Source(p), seen=0.0, sent=POLICY) for p in poses
     )
     return state._replace(drones=drones)
 
@@ -217,7 +217,7 @@ def test_an_own_estimate_that_is_elsewhere_is_not_believed_for_having_waited():
         sample = PoseSample(own, now, 4.0, captured=still(now, PLACES[0]))
         state, _ = step(state, event(now, s0=sample))
         estimate = state.drones[0].estimate
-        assert math.dist(estimate.position, PLACES[0]) < 0.05 and not state.drones[0].capture_fault
+        assert math.dist(estimate.position, PLACES[0]) < 0.05 and not state.drones[0].captured.fault
 
 
 def test_the_estimator_on_board_is_told_what_is_near_it_and_no_more():
@@ -243,7 +243,7 @@ def test_the_estimator_on_board_is_told_what_is_near_it_and_no_more():
 )
 def test_what_is_out_of_limits_ends_the_game_for_all(pose, reason):
     state = pursuing()
-    drone = state.drones[1]._replace(own=PoseHistory(pose), estimate=pose)
+    drone = state.drones[1]._replace(own=Source(pose), estimate=pose)
     state = state._replace(drones=(state.drones[0], drone, state.drones[2]))
     seen = pose._replace(
         time=0.01, position=(pose.position[0] + 0.01 * pose.velocity[0] + 1e-4, *pose.position[1:])
@@ -291,7 +291,7 @@ def test_who_leans_the_wrong_way_turns_before_it_pushes():
 def test_upside_down_for_long_its_motors_are_off_and_the_others_land():
     state = pursuing()
     over = (0.1, 0.995, 0.0, 0.0)
-    drone = state.drones[1]._replace(own=PoseHistory(Pose(0.0, PLACES[1], (0.0,) * 3, over)))
+    drone = state.drones[1]._replace(own=Source(Pose(0.0, PLACES[1], (0.0,) * 3, over)))
     state = state._replace(drones=(state.drones[0], drone, state.drones[2]))
     for k in range(1, 20):
         seen = PoseSample(still(0.01 * k, PLACES[1], quaternion=over), 0.01 * k, 4.0)

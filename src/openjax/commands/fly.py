@@ -116,7 +116,8 @@ def fly(arguments: FlyCommand, preparation: Prepared | None = None) -> None:
 def _fly(arguments: FlyCommand, preparation: Prepared | None) -> None:
     """Fly vehicles that are nobody else's."""
     console = output_console()
-    from openjax.flying.loop import FlightLoop, FlightPlan
+    from openjax.flying.course import FlightPlan
+    from openjax.flying.loop import FlightLoop
     from openjax.flying.session import Session
 
     if preparation is None:

@@ -29,6 +29,10 @@ TILT_LIMIT = math.radians(35.0)
 """Of what is asked for (rad)."""
 CLIMB_LIMIT = 4.0
 """Largest vertical acceleration asked for (m/s^2)."""
+NEAR = 0.06
+"""A vehicle has arrived this close to its target (m) ..."""
+SLOW = 0.15
+"""... and at less than this speed (m/s)."""
 
 
 class Pose(NamedTuple):
@@ -104,6 +108,13 @@ def roll_pitch_yaw(quaternion) -> Vector:
         math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0)),
         math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
     )
+
+
+def yaw_only(quaternion) -> tuple[float, float, float, float]:
+    """The attitude (4,) wxyz without roll and pitch."""
+    w, _, _, z = quaternion
+    size = math.hypot(w, z)
+    return (w / size, 0.0, 0.0, z / size) if size > 1e-6 else (1.0, 0.0, 0.0, 0.0)
 
 
 def body_axis(quaternion) -> Vector:
@@ -211,3 +222,15 @@ def accelerate(
             thrust,
         )
     return SetPoint(ANGLES, wanted_roll, wanted_pitch, yaw_rate, thrust)
+
+
+def follow_velocity(pose: Pose, velocity: Vector, airframe: Airframe, trim: float) -> SetPoint:
+    """The set-point of body rates that leads from `pose` to a velocity (m/s, world)."""
+    acceleration = wanted_acceleration(pose.velocity, velocity)
+    return accelerate(pose.quaternion, acceleration, airframe, trim, RATES)
+
+
+def has_arrived(pose: Pose, target: Vector) -> bool:
+    """True if a vehicle waits at its target."""
+    is_near = math.dist(pose.position, target) < NEAR
+    return is_near and math.hypot(*pose.velocity) < SLOW

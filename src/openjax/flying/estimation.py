@@ -2,22 +2,16 @@
 can be believed.
 """
 
-import math
 from collections.abc import Sequence
 
-from openjax.flying.controller import Pose, level_acceleration, moved_on
+from openjax.flying.controller import level_acceleration, moved_on
 from openjax.flying.drift import drifting
-from openjax.flying.innovations import Innovations
-from openjax.flying.judge import PoseHistory, Verdict, agree, follows
-from openjax.flying.set_point import as_sent
+from openjax.flying.judge import Verdict, offset_of
+from openjax.flying.sources import Moment, with_motion
 from openjax.flying.state import FLYING, SPIN_UP, Drone, Mode, PoseSample, State
 
-CHECKED = (Mode.TRANSFER, Mode.READY, Mode.PURSUIT, Mode.HOLD, Mode.LAND)
-"""Modes in which nothing but air carries a vehicle, so that thrust tells its
-acceleration.
-"""
-SMOOTHING = 0.02
-"""Time constant of the low-pass of velocities from motion capture (s)."""
+AIRBORNE = (Mode.TRANSFER, Mode.READY, Mode.PURSUIT, Mode.HOLD, Mode.LAND)
+"""Modes in which nothing but air carries a vehicle."""
 
 
 def see(state: State, time: float, samples: Sequence[PoseSample]) -> State:
@@ -31,7 +25,7 @@ def see(state: State, time: float, samples: Sequence[PoseSample]) -> State:
     state = state._replace(time=time, dt=min(max(time - state.time, 0.0), 0.1))
     both = zip(state.drones, samples, strict=True)
     drones = tuple(_estimate(state, drone, sample) for drone, sample in both)
-    drift = drifting([drone.innovations.drift for drone in drones])
+    drift = drifting([drone.own.innovations.drift for drone in drones])
     return state._replace(
         drones=tuple(
             _without_drift(state, drone) if drifts and sample.captured is None else drone
@@ -44,14 +38,14 @@ def _without_drift(state, drone) -> Drone:
     """The drone whose own estimate drifts: none is believed any more in this flight,
     and it is where the last one was, as fast as thrust and drag explain.
     """
-    if drone.contradiction or drone.mode not in CHECKED:
+    own = drone.own
+    if own.fault or drone.mode not in AIRBORNE:
         return drone
-    pose = drone.innovations.pose
-    excess = (*drone.innovations.drift.totals, 0.0)
+    pose = own.innovations.pose
+    excess = (*own.innovations.drift.totals, 0.0)
     velocity = tuple(v - part for v, part in zip(pose.velocity, excess, strict=True))
     return drone._replace(
-        own=drone.own._replace(verdict=Verdict.DRIFTS),
-        contradiction=Verdict.DRIFTS,
+        own=own._replace(verdict=Verdict.DRIFTS, fault=Verdict.DRIFTS),
         estimate=moved_on(pose._replace(velocity=velocity), state.time),
     )
 
@@ -59,16 +53,22 @@ def _without_drift(state, drone) -> Drone:
 def _estimate(state, drone, sample) -> Drone:
     """The drone with its estimate now, after what was newly told of it."""
     time = state.time
-    limits = state.limits
-    moving = drone.mode in FLYING and not (drone.mode is Mode.LIFT and time - drone.since < SPIN_UP)
-    by_capture = sample.captured is not None and not drone.capture_fault
-    track = _onboard_track(state, drone, sample, by_capture, moving)
-    drone = _consistent(state, drone, track, sample.force)
-    if by_capture and not drone.capture_fault:
-        drone = _with_capture(state, drone, sample, moving)
-    source = drone.captured if by_capture and not drone.capture_fault else drone.own
-    is_contradiction = source is drone.own and drone.contradiction
-    if source.fresh(time, limits) and not is_contradiction:
+    spins_up = drone.mode is Mode.LIFT and time - drone.since < SPIN_UP
+    moment = Moment(
+        time,
+        state.limits,
+        state.airframe,
+        sent=drone.sent,
+        moving=drone.mode in FLYING and not spins_up,
+        airborne=drone.mode in AIRBORNE,
+    )
+    has_capture = sample.captured is not None
+    if not drone.own.fault:
+        drone = _with_own(drone, sample, moment, has_capture and not drone.captured.fault)
+    if has_capture and not drone.captured.fault:
+        drone = _with_capture(drone, sample, moment)
+    source = drone.captured if has_capture and not drone.captured.fault else drone.own
+    if source.fresh(moment) and not source.fault:
         estimate = moved_on(source.pose, max(time, source.pose.time))
         level = level_acceleration(estimate.quaternion)
         return drone._replace(estimate=estimate, seen=source.pose.time, acceleration=level)
@@ -86,119 +86,57 @@ def _reckon(state, drone) -> Drone:
     return drone._replace(estimate=estimate)
 
 
-def _consistent(state, drone, own_track, force) -> Drone:
-    """The drone after its newest own estimate, with what its accelerometer feels.
-
-    If its innovations contradict that, none is believed any more in this flight, nor
-    motion capture where it tells the same: what the estimator on board follows can't
-    confirm it.
+def _with_own(drone, sample, moment, by_capture) -> Drone:
+    """The drone after its newest own estimate. `by_capture`: whether it is flown by motion
+    capture, which must confirm its own where that was lost or wrong.
     """
-    if drone.contradiction:
-        return drone._replace(own=drone.own._replace(verdict=drone.contradiction))
-    if drone.mode not in CHECKED:
-        return drone._replace(own=own_track, innovations=Innovations())
-    if own_track.pose is drone.own.pose:
+    own = drone.own
+    captured = drone.captured
+    limits = moment.limits
+    is_led = by_capture and own.fresh(moment)
+    # what it is flown by is motion capture: that says nothing of where its own leads
+    newer = own.update(sample.own, moment, None if is_led else drone.estimate)
+    is_new = newer.pose is not own.pose
+    to_confirm = is_new and by_capture and not is_led and moment.moving and captured.fresh(moment)
+    if to_confirm and not offset_of(captured.pose, newer.pose).is_agreement(limits):
+        newer = newer._replace(pose=own.pose, verdict=Verdict.JUMPED)
+        is_new = False
+    next_own = own.check_motion(newer, moment, sample.force)
+    if not is_new:
         # what told nothing but wrong poses until it was lost may tell believable ones,
         # of another place, once anything can have happened
-        verdict_lost = own_track.verdict and not any(
-            track.fresh(state.time, state.limits) for track in (own_track, drone.captured)
-        )
-        return drone._replace(
-            own=own_track, contradiction=own_track.verdict if verdict_lost else Verdict.GOOD
-        )
-    is_refused = bool(drone.own.verdict)
-    innovations = drone.innovations.update(
-        own_track.pose, as_sent(drone.sent), state.airframe, is_refused
-    )
-    innovations = innovations.feeling(force)
-    verdict = innovations.verdict()
-    capture = drone.captured
-    if not verdict:
-        return drone._replace(own=own_track, innovations=innovations)
-    drone = drone._replace(
-        own=drone.own._replace(verdict=verdict), innovations=innovations, contradiction=verdict
-    )
-    # motion capture tells otherwise than the estimate, so it isn't what the estimate
-    # followed
-    if capture.pose is not None and not follows(capture.pose, own_track.pose, state.limits):
+        is_lost = moment.airborne and not (own.fresh(moment) or captured.fresh(moment))
+        return drone._replace(own=next_own._replace(fault=next_own.verdict if is_lost else ""))
+    drone = drone._replace(own=next_own)
+    # where motion capture tells otherwise than the estimate, it isn't what that followed
+    if not next_own.fault or (
+        captured.pose is not None and not offset_of(captured.pose, newer.pose).is_error(limits)
+    ):
         return drone
-    # neither is believed any more: back to where the sums say that the vehicle is
-    estimate = moved_on(innovations.corrected_pose(), state.time)
-    return drone._replace(estimate=estimate, capture_fault=verdict)
+    # what the estimator on board follows can't confirm it: neither is believed any more,
+    # back to where the sums say that the vehicle is
+    estimate = moved_on(next_own.innovations.corrected_pose(), moment.time)
+    return drone._replace(estimate=estimate, captured=captured._replace(fault=next_own.fault))
 
 
-def _onboard_track(state, drone, sample, by_capture, moving) -> PoseHistory:
-    """The drone's own estimates after the newest one, which motion capture must confirm
-    where they were lost or wrong.
-    """
-    time = state.time
-    limits = state.limits
-    track = drone.own
-    if by_capture and track.fresh(time, limits):
-        # what it is flown by is motion capture: that says nothing of where its own
-        # leads
-        return track.update(sample.own, time, limits, moving, None)
-    next_track = track.update(sample.own, time, limits, moving, drone.estimate)
-    capture = drone.captured
-    to_confirm = (
-        moving and by_capture and next_track.pose is not track.pose and capture.fresh(time, limits)
-    )
-    if to_confirm and agree(capture.pose, next_track.pose, limits) is Verdict.APART:
-        return next_track._replace(pose=track.pose, verdict=Verdict.JUMPED)
-    return next_track
-
-
-def _with_capture(state, drone, sample, moving) -> Drone:
+def _with_capture(drone, sample, moment) -> Drone:
     """The drone after the newest of motion capture: whether it is believed, and told to
     the estimator on board.
     """
-    time = state.time
-    limits = state.limits
-    estimates = drone.own
-    capture = _with_motion(sample.captured, drone.captured.pose, sample.own)
-    track = drone.captured.update(capture, time, limits, moving, drone.estimate)
-    capture_fault = ""
-    if track.pose is capture:
+    own = drone.own
+    captured = drone.captured
+    pose = with_motion(sample.captured, captured.pose, sample.own)
+    newer = captured.update(pose, moment, drone.estimate)
+    if newer.pose is pose:
+        feeds = True
         # on the ground, or with no pose of its own, there is nothing to compare it with
-        comparable = moving and estimates.pose is not None
-        feeds = not comparable or follows(capture, estimates.pose, limits)
+        if moment.moving and own.pose is not None:
+            offset = offset_of(pose, own.pose)
+            feeds = offset.is_error(moment.limits)
+            if own.fresh(moment) and not offset.is_agreement(moment.limits):
+                newer = newer._replace(pose=captured.pose, verdict=Verdict.APART)
         drone = drone._replace(feeds_estimator=feeds)
-        verdict = Verdict.GOOD
-        if comparable and estimates.fresh(time, limits):
-            verdict = agree(capture, estimates.pose, limits)
-        if verdict:
-            track = track._replace(pose=drone.captured.pose, verdict=verdict)
-    innovations = drone.captured_innovations
-    if drone.mode not in CHECKED:
-        innovations = Innovations()
-    elif track.pose is capture and capture is not drone.captured.pose:
-        is_refused = bool(drone.captured.verdict)
-        innovations = innovations.update(capture, as_sent(drone.sent), state.airframe, is_refused)
-        capture_fault = innovations.verdict()
-    if capture_fault:
-        track = track._replace(pose=drone.captured.pose, verdict=capture_fault)
-    elif moving and not track.fresh(time, limits):
-        capture_fault = track.verdict or "pose lost"
-    return drone._replace(
-        captured=track, captured_innovations=innovations, capture_fault=capture_fault
-    )
-
-
-def _with_motion(pose, last, estimate) -> Pose:
-    """A pose of motion capture with the velocity from differences, smoothed, and the
-    body rates of the gyroscope.
-    """
-    if last is None or pose.time <= last.time:
-        return pose if last is None else last
-    if (pose.position, pose.quaternion) == (last.position, last.quaternion):
-        return last._replace(time=pose.time)  # which is judged frozen
-    step = pose.time - last.time
-    # differences of poses that are off by a millimetre jump by .1 m/s at 100 Hz
-    share = 1.0 - math.exp(-step / SMOOTHING)
-    velocity = tuple(
-        v + share * ((p - q) / step - v)
-        for p, q, v in zip(pose.position, last.position, last.velocity, strict=True)
-    )
-    return pose._replace(
-        velocity=velocity, body_rates=pose.body_rates if estimate is None else estimate.body_rates
-    )
+    newer = captured.check_motion(newer, moment)
+    if moment.moving and not newer.fault and not newer.fresh(moment):
+        newer = newer._replace(fault=newer.verdict or "pose lost")
+    return drone._replace(captured=newer)

@@ -1,7 +1,7 @@
 """Judge whether a pose may be flown by: a measurement against what a vehicle can have done since
 the last good one.
 
-`judge` compares a pose with the last good one of the same source, `agree` motion
+`judge` compares a pose with the last good one of the same source, `offset_of` motion
 capture with the vehicle's own estimate. Both are pure. What they don't accept is a lost
 pose, whatever sent it.
 """
@@ -124,69 +124,35 @@ def judge(
     return Verdict.GOOD
 
 
-class PoseHistory(NamedTuple):
-    """The history of one source of a vehicle's poses."""
+class Offset(NamedTuple):
+    """The distance of motion capture from the vehicle's own estimate."""
 
-    pose: Pose | None = None  # the last good one
-    verdict: Verdict = Verdict.GOOD  # on the newest
-    last_time: float = -math.inf  # s, when that was measured
+    distance: float  # m
+    angle: float  # rad
 
-    def fresh(self, time: float, limits: PoseLimits) -> bool:
-        """True if its last good pose is new enough to fly by at `time` (s)."""
-        return self.pose is not None and time - self.pose.time <= limits.horizon
+    def is_agreement(self, limits: PoseLimits) -> bool:
+        """True if both can be right."""
+        return self.distance <= limits.apart and self.angle <= limits.turned
 
-    def update(
-        self,
-        pose: Pose | None,
-        time: float,
-        limits: PoseLimits,
-        moving: bool,
-        prediction: Pose | None,
-    ) -> "PoseHistory":
-        """The track after its source's newest pose at `time` (s).
+    def is_error(self, limits: PoseLimits) -> bool:
+        """True if errors of one pose explain the distance, so that the estimator on board may
+        be given it.
 
-        A pose that isn't newer than the last good one, or old, or from the future,
-        changes nothing. Of a vehicle that isn't `moving` any pose is believed that is
-        one. `prediction`: see `judge`; at any time.
+        An estimator that is told late or drifting poses takes their error for a velocity,
+        by which it would have to land.
         """
-        last = self.pose
-        if pose is None or not abs(time - pose.time) <= limits.horizon:
-            return self
-        if last is None or not moving:
-            verdict = judge(pose, None, 0.0, limits)
-        elif pose.time <= last.time:
-            return self
-        else:
-            prediction = None if prediction is None else moved_on(prediction, pose.time)
-            verdict = judge(
-                pose, last, pose.time - max(self.last_time, last.time), limits, prediction
-            )
-        return PoseHistory(last if verdict else pose, verdict, pose.time)
+        return self.distance <= limits.position
 
 
-def at_one_time(a: Pose, b: Pose) -> tuple[Pose, Pose]:
-    """Both, moved on to the later one's time."""
-    newer = max(a.time, b.time)
-    return moved_on(a, newer), moved_on(b, newer)
-
-
-def agree(capture: Pose, estimate: Pose, limits: PoseLimits) -> Verdict:
-    """Compare motion capture with the vehicle's own estimate, at the later one's time."""
-    capture, estimate = at_one_time(capture, estimate)
-    is_near = math.dist(capture.position, estimate.position) <= limits.apart
-    is_aligned = angle_between(capture.quaternion, estimate.quaternion) <= limits.turned
-    return Verdict.GOOD if is_near and is_aligned else Verdict.APART
-
-
-def follows(capture: Pose, estimate: Pose, limits: PoseLimits) -> bool:
-    """True if the estimator on board may be given a pose of motion capture: errors explain the
-    distance from its own, at the later one's time.
-
-    An estimator that is told late or drifting poses takes their error for a velocity,
-    by which it would have to land.
-    """
-    capture, estimate = at_one_time(capture, estimate)
-    return math.dist(estimate.position, capture.position) <= limits.position
+def offset_of(capture: Pose, estimate: Pose) -> Offset:
+    """How far motion capture is from the vehicle's own estimate, at the later one's time."""
+    newer = max(capture.time, estimate.time)
+    capture = moved_on(capture, newer)
+    estimate = moved_on(estimate, newer)
+    return Offset(
+        math.dist(capture.position, estimate.position),
+        angle_between(capture.quaternion, estimate.quaternion),
+    )
 
 
 def angle_between(a, b) -> float:

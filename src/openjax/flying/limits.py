@@ -100,6 +100,23 @@ def parting_velocity(
     return velocity
 
 
+def safe_velocity(
+    settings: SafetySettings, i: int, poses: Sequence[Pose | None], acceleration: Vector
+) -> Vector | None:
+    """The velocity (m/s) that keeps vehicle i in the arena and off the others; None while
+    neither is in danger. `acceleration`: its own at present (m/s^2, world).
+    """
+    pose = poses[i]
+    parting = parting_velocity(settings, i, poses) if settings.separation > 0.0 else None
+    # who makes room for another mustn't leave the arena for that
+    aim = pose if parting is None else pose._replace(velocity=parting)
+    return (
+        fence_velocity(settings, pose, acceleration)
+        or fence_velocity(settings, aim, acceleration)
+        or parting
+    )
+
+
 def within_reach(action: SetPoint, previous: SetPoint, airframe: Airframe, dt: float) -> SetPoint:
     """The action within its bounds, and no farther from what was sent `dt` (s) before
     than the vehicle can follow.

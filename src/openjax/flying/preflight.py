@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from openjax.flying.controller import Vector, roll_pitch_yaw, up
 from openjax.flying.crtp import Supervisor
-from openjax.flying.judge import agree, judge
+from openjax.flying.judge import judge, offset_of
 from openjax.flying.member import PERIOD_MS
 from openjax.flying.state import PoseSample, State
 
@@ -120,7 +120,7 @@ def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
         yield "doesn't face +x; turn it, or correct the body's axes"
     if sample.captured is None or sample.own is None:
         return
-    if agree(sample.captured, sample.own, limits):
+    if not offset_of(sample.captured, sample.own).is_agreement(limits):
         place = ", ".join(f"{p:.2f}" for p in sample.own.position)
         yield (
             f"motion capture sees it at {spot} m, its own estimate at ({place}): correct axes, "

@@ -13,6 +13,7 @@ Troubles: its pose is lost, its link is silent, its battery low, it is too fast,
 tilted, or outside the arena; no action came in time; a key.
 """
 
+import functools
 import math
 
 from openjax.flying.controller import Vector, up
@@ -58,11 +59,10 @@ def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
     else:
         # the clock of the actions starts with the game
         action_time = time
-    state = state._replace(drones=_react(state, drones, troubles), action_time=action_time)
-    next_drones = tuple(
-        steer(state, i, actions[i] if finite else None, sample)
-        for i, sample in enumerate(event.samples)
-    )
+    drones = _react(state, drones, troubles)
+    watched = tuple(map(functools.partial(_watch, state), drones, event.samples))
+    state = state._replace(drones=watched, action_time=action_time)
+    next_drones = tuple(steer(state, i, actions[i] if finite else None) for i in range(len(drones)))
     return state._replace(drones=next_drones), tuple(drone.sent for drone in next_drones)
 
 
@@ -161,7 +161,7 @@ def _trouble(state, drone, sample) -> tuple[Mode, str] | None:
     # who lands already goes on landing, whatever else is wrong with it
     fault = loss
     if not loss and drone.mode is not Mode.LAND:
-        fault = drone.capture_fault or _unfit(state, drone)
+        fault = drone.captured.fault or _unfit(state, drone)
     return (Mode.LAND, fault) if fault else None
 
 
@@ -226,6 +226,23 @@ def _has_lifted(drone, time) -> bool:
     """True once a test lift is over; not before its rotors must have turned up."""
     is_near = abs(drone.estimate.position[2] - drone.anchor[2]) < RISEN
     return is_near and time - drone.since > 2.0 * SPIN_UP
+
+
+def _watch(state, drone, sample) -> Drone:
+    """The drone with since when its battery is low and since when it is upside down."""
+
+    def since(begin, is_so):
+        return (state.time if begin is None else begin) if is_so else None
+
+    low = sample.voltage < state.settings.battery_low  # an unknown voltage is not low
+    over = drone.estimate is not None and up(drone.estimate.quaternion) < 0.0
+    is_confirmed = drone.captured.pose is not None and not drone.captured.fault
+    is_alone = drone.mode in FLYING and not is_confirmed
+    return drone._replace(
+        alone_since=since(drone.alone_since, is_alone),
+        low_since=since(drone.low_since, low),
+        over_since=since(drone.over_since, over),
+    )
 
 
 def resting_places_of(state: State) -> list[Vector]:

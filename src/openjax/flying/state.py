@@ -8,9 +8,9 @@ from typing import Annotated, NamedTuple
 
 from openjax.flying.controller import Airframe, Pose, Vector, nominal_airframe
 from openjax.flying.crtp import Supervisor
-from openjax.flying.innovations import Innovations
-from openjax.flying.judge import PoseHistory, PoseLimits, Verdict
+from openjax.flying.judge import PoseLimits
 from openjax.flying.set_point import MOTORS_OFF, SetPoint
+from openjax.flying.sources import Source
 from openjax.ranges import Interval, check_intervals
 from openjax.vehicle.arena import Arena
 
@@ -20,8 +20,7 @@ FORCE_AGE = 0.025
 """An accelerometer's sample tells of a pose that was measured no longer (s) before or
 after it.
 """
-_NOTHING_SEEN = PoseHistory()
-_NOTHING_SUMMED = Innovations()
+_NOTHING_SEEN = Source()
 
 
 @dataclass(frozen=True)
@@ -166,16 +165,11 @@ class Drone(NamedTuple):
     since: float = 0.0  # s, when the mode began
     # where it is now: the newest pose, moved on to this tick
     estimate: Pose | None = None
-    own: PoseHistory = _NOTHING_SEEN  # its own estimates
-    innovations: Innovations = _NOTHING_SUMMED  # of its own estimates
-    captured_innovations: Innovations = _NOTHING_SUMMED  # of motion capture
-    # why its own aren't believed any more in this flight
-    contradiction: Verdict = Verdict.GOOD
-    captured: PoseHistory = _NOTHING_SEEN  # motion capture, with velocity and rates
+    own: Source = _NOTHING_SEEN  # its own estimates
+    captured: Source = _NOTHING_SEEN  # motion capture, with velocity and rates
     # whether the estimator on board is to follow the newest of it
     feeds_estimator: bool = True
     seen: float = -math.inf  # s, when the pose that it is flown by was measured
-    capture_fault: str = ""  # why motion capture isn't believed any more in this flight
     # own and captured position before the lift, where there is one
     stand: tuple[Vector | None, Vector | None] = (None, None)
     acceleration: Vector = (0.0, 0.0, 0.0)  # m/s^2, what dead reckoning takes it to be

@@ -7,15 +7,17 @@ import math
 from openjax.flying.controller import (
     Vector,
     accelerate,
+    follow_velocity,
+    has_arrived,
     lift_acceleration,
     turned_on,
-    up,
     wanted_acceleration,
     wanted_velocity,
+    yaw_only,
 )
-from openjax.flying.limits import APART, fence_velocity, parting_velocity, within_reach
-from openjax.flying.set_point import ANGLES, LEAST_THRUST, MOTORS_OFF, RATES, SetPoint
-from openjax.flying.state import FLYING, Drone, Mode, PoseSample, State
+from openjax.flying.limits import APART, safe_velocity, within_reach
+from openjax.flying.set_point import ANGLES, LEAST_THRUST, MOTORS_OFF, SetPoint
+from openjax.flying.state import FLYING, Drone, Mode, State
 
 LOW = 0.05
 """Below this height (m) a landing settles."""
@@ -33,11 +35,11 @@ TRIM_LIMIT = 0.15
 """Largest trim, as a share of full thrust."""
 
 
-def steer(state: State, i: int, action: SetPoint | None, sample: PoseSample) -> Drone:
+def steer(state: State, i: int, action: SetPoint | None) -> Drone:
     """Vehicle i after this tick, with its set-point. `action`: the policy's, where
     there is one.
     """
-    drone = _watch(state, state.drones[i], sample)._replace(sent=MOTORS_OFF)
+    drone = state.drones[i]._replace(sent=MOTORS_OFF)
     time = state.time
     if drone.mode not in FLYING or drone.estimate is None:
         return drone
@@ -54,23 +56,6 @@ def steer(state: State, i: int, action: SetPoint | None, sample: PoseSample) -> 
     return _go(state, drone, i)
 
 
-def _watch(state, drone, sample) -> Drone:
-    """The drone with since when its battery is low and since when it is upside down."""
-
-    def since(begin, is_so):
-        return (state.time if begin is None else begin) if is_so else None
-
-    low = sample.voltage < state.settings.battery_low  # an unknown voltage is not low
-    over = drone.estimate is not None and up(drone.estimate.quaternion) < 0.0
-    is_confirmed = drone.captured.pose is not None and not drone.capture_fault
-    is_alone = drone.mode in FLYING and not is_confirmed
-    return drone._replace(
-        alone_since=since(drone.alone_since, is_alone),
-        low_since=since(drone.low_since, low),
-        over_since=since(drone.over_since, over),
-    )
-
-
 def _is_low(state, drone) -> bool:
     """True if a landing is near the floor, or long enough on the way."""
     overdue = state.time - drone.since > state.settings.landing_time
@@ -79,30 +64,17 @@ def _is_low(state, drone) -> bool:
 
 def _pursue(state, drone, i, action) -> SetPoint:
     """The policy's action, or what keeps the drone in the arena and off the others."""
-    settings = state.settings
-    estimate = drone.estimate
-    parting = None
-    if settings.separation > 0.0:
-        poses = [d.estimate if d.mode in FLYING else None for d in state.drones]
-        parting = parting_velocity(settings, i, poses)
-    # who makes room for another mustn't leave the arena for that
-    aim = estimate if parting is None else estimate._replace(velocity=parting)
-    previous = state.drones[i].sent
+    pose = drone.estimate
+    sent = state.drones[i].sent
     # until its motors have followed it turns on
-    set_point = turned_on(
-        estimate.quaternion, estimate.body_rates, state.airframe.motor_time_constant
-    )
-    lift = max(previous.thrust, LEAST_THRUST) / state.airframe.hover_thrust
-    present = lift_acceleration(set_point, lift)
-    velocity = (
-        fence_velocity(settings, estimate, present)
-        or fence_velocity(settings, aim, present)
-        or parting
-    )
+    attitude = turned_on(pose.quaternion, pose.body_rates, state.airframe.motor_time_constant)
+    lift = max(sent.thrust, LEAST_THRUST) / state.airframe.hover_thrust
+    present = lift_acceleration(attitude, lift)
+    poses = [d.estimate if d.mode in FLYING else None for d in state.drones]
+    velocity = safe_velocity(state.settings, i, poses, present)
     if velocity is None:
-        return within_reach(action, previous, state.airframe, state.dt)
-    acceleration = wanted_acceleration(estimate.velocity, velocity)
-    return accelerate(estimate.quaternion, acceleration, state.airframe, drone.trim, RATES)
+        return within_reach(action, sent, state.airframe, state.dt)
+    return follow_velocity(pose, velocity, state.airframe, drone.trim)
 
 
 def _go(state, drone, i) -> Drone:
@@ -117,14 +89,14 @@ def _go(state, drone, i) -> Drone:
         share = min(state.dt / state.settings.reaction, 1.0)
         change = zip(drone.acceleration, acceleration, strict=True)
         drone = drone._replace(acceleration=tuple(a + share * (b - a) for a, b in change))
-        attitude = _yaw_only(attitude)
+        attitude = yaw_only(attitude)
     else:
         # not lower: on the floor a vehicle that doesn't climb isn't too heavy
         if estimate.position[2] > (0.02 if drone.mode is Mode.LIFT else 0.1):
             error = min(max(velocity[2] - estimate.velocity[2], -0.3), 0.3)
             trim = min(max(drone.trim + TRIM_GAIN * state.dt * error, -TRIM_LIMIT), TRIM_LIMIT)
             drone = drone._replace(trim=trim)
-        if drone.mode is Mode.TRANSFER and _is_there(estimate, drone.anchor):
+        if drone.mode is Mode.TRANSFER and has_arrived(estimate, drone.anchor):
             drone = drone.to(Mode.READY, state.time)
     return drone._replace(sent=accelerate(attitude, acceleration, airframe, drone.trim, ANGLES))
 
@@ -155,17 +127,3 @@ def _target_velocity(state, drone, i) -> Vector:
             x = x + push * (dx + dy)
             y = y + push * (dy - dx)
     return x, y, z
-
-
-def _is_there(estimate, target) -> bool:
-    return (
-        math.dist(estimate.position, target) < 0.06
-        and math.dist(estimate.velocity, (0.0, 0.0, 0.0)) < 0.15
-    )
-
-
-def _yaw_only(quaternion):
-    """The attitude (4,) wxyz without roll and pitch."""
-    w, _, _, z = quaternion
-    size = math.hypot(w, z)
-    return (w / size, 0.0, 0.0, z / size) if size > 1e-6 else (1.0, 0.0, 0.0, 0.0)
