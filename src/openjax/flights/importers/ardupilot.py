@@ -17,14 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from openjax.errors import UserError
 from openjax.flights.csv_text import LARGEST, LogError
-from openjax.flights.importers.columns import (
-    UNITS,
-    ColumnMapping,
-    Source,
-    Stream,
-    merge_streams,
-)
+from openjax.flights.importers.columns import UNITS, ColumnMapping, Source
 from openjax.flights.importers.importer import Importer
+from openjax.flights.importers.streams import Stream, merge_streams
 from openjax.flights.reading import CHANNEL_COLUMNS, LogTable
 
 MAGIC = b"\xa3\x95\x80"

@@ -24,9 +24,10 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.flights.csv_text import LARGEST, find_header, head_of
-from openjax.flights.importers.columns import UNITS, ColumnMapping, Source, Stream, merge_streams
+from openjax.flights.importers.columns import UNITS, ColumnMapping, Source
 from openjax.flights.importers.csv_files import delimiter_of, is_csv, raw_columns
 from openjax.flights.importers.importer import Importer
+from openjax.flights.importers.streams import Stream, merge_streams
 from openjax.flights.reading import CHANNEL_COLUMNS, LogError, LogTable
 
 MAGIC = b"H Product:Blackbox"

@@ -1,14 +1,17 @@
-"""Column mapping: which column, log variable or message field holds what, in which
+"""The mapping of columns: which column, log variable or message field holds what, in which
 unit.
 
 A `columns.toml` in a case folder applies to all its logs. A CSV column that it doesn't
 name and that has a name of the log format is taken as it is:
 
-delimiter = ";"                                        # CSV only; by its header if left
-out [columns] t      = { from = "timestamp", unit = "ms" } x      = "pos_x"
-# already in the log format's unit wx     = { from = "gyro.x", unit = "deg/s" }
-# a micro-SD log variable ax     = { from = "/cf1/imu:linear_acceleration.x" }   # a
-field of a ROS 2 topic cmd_wy = { from = "pitch_rate", unit = "deg/s", scale = -1 }
+    delimiter = ";"  # CSV only; by its header if left out
+
+    [columns]
+    t = { from = "timestamp", unit = "ms" }
+    x = "pos_x"  # already in the log format's unit
+    wx = { from = "gyro.x", unit = "deg/s" }  # a micro-SD log variable
+    ax = { from = "/cf1/imu:linear_acceleration.x" }  # a field of a ROS 2 topic
+    cmd_wy = { from = "pitch_rate", unit = "deg/s", scale = -1 }
 
 A CSV whose topics have time stamps of their own names each, and what is `of` it; where
 names begin as the stamp's does ("imu.time", "imu.wx"), that may be left out:
@@ -34,7 +37,6 @@ from scipy.spatial.transform import Rotation
 from openjax.errors import UserError
 from openjax.files import read_toml
 from openjax.flights.reading import CHANNEL_COLUMNS, LOG_COLUMNS, LogError, LogTable
-from openjax.flights.sampling import several_recordings
 
 MAPPING_FILE = "columns.toml"
 EULER = ("roll", "pitch", "yaw")
@@ -53,19 +55,6 @@ WITH_UNIT = re.compile(r"(.+?) *[(\[](.+)[)\]]").fullmatch
 """A name with its unit: "wx [deg/s]", "x (m)"."""
 WRITTEN = {"m/s2": "m/s^2", "m/s²": "m/s^2", "°": "deg", "°/s": "deg/s", "%": "percent", "-": "1"}
 """Other spellings of units."""
-
-_MOTION = {
-    *CHANNEL_COLUMNS["position"],
-    *CHANNEL_COLUMNS["quaternion"],
-    *CHANNEL_COLUMNS["body_rates"],
-    *CHANNEL_COLUMNS["specific_force"],
-}
-_CONTINUOUS = _MOTION.union(CHANNEL_COLUMNS["velocity"], CHANNEL_COLUMNS["rotor_speed"], EULER)
-OVERTAKEN = 1.0  # s by which a message may come before an older one
-# s: stamps since 1970 are known to .24 us, so that what is sent with a row may seem
-# later
-TIE = 1e-6
-_STALE = 5.0  # periods after which a stream's last value counts as not sampled
 
 
 @dataclass(frozen=True)
@@ -87,14 +76,6 @@ class Clock:
 
     source: Source
     columns: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, eq=False)
-class Stream:
-    """Raw signals sampled together: time (N,) s and values {raw name: (N,)}."""
-
-    time: np.ndarray
-    values: dict[str, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +144,23 @@ class ColumnMapping:
         return LogTable(name, columns, raw.vehicle, tuple(remarks), clock_start=start)
 
 
+def _without_attitude(columns: dict) -> dict:
+    """Without the quaternion: named angles stand in its place."""
+    return {c: v for c, v in columns.items() if c not in CHANNEL_COLUMNS["quaternion"]}
+
+
+def with_quaternion(
+    columns: dict[str, Shaped[np.ndarray, " rows"]],
+) -> dict[str, Shaped[np.ndarray, " rows"]]:
+    """Roll, pitch, yaw replaced by the quaternion, unless that is there."""
+    angles = [columns.get(name) for name in EULER]
+    rest = {c: v for c, v in columns.items() if c not in EULER}
+    if any(a is None for a in angles) or all(c in rest for c in CHANNEL_COLUMNS["quaternion"]):
+        return rest
+    attitude = Rotation.from_euler("ZYX", np.stack(angles[::-1], 1)).as_quat(scalar_first=True)
+    return rest | dict(zip(CHANNEL_COLUMNS["quaternion"], attitude.T, strict=True))
+
+
 def with_units(mapping: ColumnMapping | None, names: list[str]) -> ColumnMapping:
     """A mapping with what a header's names say of units, "wx [deg/s]": a column of the log
     format is taken from such a name, and a source that the mapping gives without a unit,
@@ -224,159 +222,6 @@ def load_mapping(path: str | Path) -> ColumnMapping:
     return ColumnMapping(columns, delimiter, clocks)
 
 
-def _clock(entry, path: Path) -> Clock:
-    """One of several time stamps. Raises UserError for an unknown column, key or
-    unit.
-    """
-    columns = entry.get("of", []) if isinstance(entry, dict) else []
-    possible = (*LOG_COLUMNS[2:], *EULER)
-    unknown = (
-        [name for name in columns if name not in possible]
-        if isinstance(columns, list)
-        else [columns]
-    )
-    if unknown:
-        raise UserError(
-            f"{path}: a time stamp is `of` {unknown[0]!r}; it must be a list of columns out of "
-            f"{', '.join(possible)}"
-        )
-    rest = {k: v for k, v in entry.items() if k != "of"} if isinstance(entry, dict) else entry
-    return Clock(source_of("t", rest, path), tuple(columns))
-
-
-def merge_streams(
-    streams: list[Stream], columns: dict[str, Source]
-) -> dict[str, Shaped[np.ndarray, " rows"]]:
-    """Columns of the log format on one clock: that of the fastest stream with motion in
-    it (`t` as in the stream).
-
-    Other motion streams are interpolated linearly, commands are held, the battery keeps
-    its own samples. What is older than five periods of its stream counts as not
-    sampled. Raises LogError if no motion is there, if a stream holds several
-    recordings, or if it ends before the others begin.
-    """
-    series = []
-    for stream in streams:
-        sources = {c: s for c, s in columns.items() if s.name in stream.values}
-        if sources and np.isfinite(stream.time).sum() > 1:
-            series.append(_convert(stream, sources))
-    with_motion = [u for u in series if _MOTION & set(u[1])]
-    if not with_motion:
-        raise LogError(
-            "holds neither position and orientation nor a gyroscope under known names: name what "
-            "it has in columns.toml"
-        )
-    # to a microsecond: of streams at one rate the first is the clock, however stamps
-    # are rounded
-    clock = min(with_motion, key=lambda u: round(float(np.median(np.diff(u[0]))), 6))[0]
-    # a message that came twice is one row
-    clock = clock[np.r_[True, np.diff(clock) > 0]]
-    series = _at_one_time(series, clock)
-    table = {"t": clock}
-    for time, columns_of_stream in series:
-        # of stamps that all are the same the median is nought
-        period = max(float(np.median(np.diff(time))), 1e-4)
-        for column, values in columns_of_stream.items():
-            table.setdefault(column, _onto(clock, time, values, column, period))
-    return with_quaternion(table)
-
-
-def _convert(
-    stream: Stream, sources: dict[str, Source]
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Times of a stream, sorted, and its columns in the log format's units. Raises
-    LogError for several recordings.
-    """
-    finite = np.isfinite(stream.time)
-    time = stream.time[finite]
-    back = float(np.diff(time).min())
-    if back < -OVERTAKEN and (problem := several_recordings(time)):
-        raise LogError(problem)
-    order = np.argsort(time, kind="stable")
-    columns = {}
-    for column, source in sources.items():
-        values = source.scale * stream.values[source.name] + source.offset
-        columns[column] = values[finite][order]
-    return time[order], columns | _without_flips(columns)
-
-
-def _at_one_time(streams, clock: np.ndarray) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
-    """The streams that were logged while the clock ran. Raises LogError for one that
-    wasn't, where no other one has its columns; the battery may be missing.
-    """
-    beside = [u for u in streams if u[0][0] <= clock[-1] and u[0][-1] >= clock[0]]
-    elsewhere = {column for _, columns_of_stream in beside for column in columns_of_stream}
-    for time, columns_of_stream in streams:
-        absent = [column for column in columns_of_stream if column not in elsewhere | {"vbat"}]
-        if absent:
-            raise LogError(
-                f"{', '.join(absent)} were logged from {time[0]:.2f} to {time[-1]:.2f} s, and "
-                f"the rest from {clock[0]:.2f} to {clock[-1]:.2f} s: of another flight, or by "
-                "another clock?"
-            )
-    return beside
-
-
-def _without_flips(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The quaternion of a stream without jumps between q and -q, which no line between
-    two samples may cross; nothing where it has none.
-    """
-    names = CHANNEL_COLUMNS["quaternion"]
-    if not all(name in columns for name in names):
-        return {}
-    quaternion = np.stack([columns[name] for name in names], 1)
-    flips = (quaternion[1:] * quaternion[:-1]).sum(1) < 0.0
-    sign = np.where(np.cumsum(np.r_[False, flips]) % 2, -1.0, 1.0)
-    return dict(zip(names, (quaternion * sign[:, None]).T, strict=True))
-
-
-def _without_attitude(columns: dict) -> dict:
-    """Without the quaternion: named angles stand in its place."""
-    return {c: v for c, v in columns.items() if c not in CHANNEL_COLUMNS["quaternion"]}
-
-
-def with_quaternion(
-    columns: dict[str, Shaped[np.ndarray, " rows"]],
-) -> dict[str, Shaped[np.ndarray, " rows"]]:
-    """Roll, pitch, yaw replaced by the quaternion, unless that is there."""
-    angles = [columns.get(name) for name in EULER]
-    rest = {c: v for c, v in columns.items() if c not in EULER}
-    if any(a is None for a in angles) or all(c in rest for c in CHANNEL_COLUMNS["quaternion"]):
-        return rest
-    attitude = Rotation.from_euler("ZYX", np.stack(angles[::-1], 1)).as_quat(scalar_first=True)
-    return rest | dict(zip(CHANNEL_COLUMNS["quaternion"], attitude.T, strict=True))
-
-
-def _onto(clock, time, values, column: str, period: float) -> np.ndarray:
-    """Values (N,) of a column at its `time` (N,) moved to the rows of `clock` (T,)."""
-    if len(time) == len(clock) and np.array_equal(time, clock):
-        return values
-    finite = np.isfinite(values)
-    time = time[finite]
-    values = values[finite]
-    if not len(time):
-        return np.full(len(clock), np.nan)
-    # what was sent with a row is there with it, however its stamp was rounded
-    previous = np.searchsorted(time, clock + TIE, side="right") - 1
-    if column == "vbat":
-        out = np.full(len(clock), np.nan)
-        nearest = np.clip(np.searchsorted(clock, time), 0, len(clock) - 1)
-        out[nearest] = values
-        return out
-    if column in _CONTINUOUS:
-        out = np.interp(clock, time, values, left=np.nan, right=np.nan)
-        following_row = np.clip(previous + 1, 0, len(time) - 1)
-        # a line over a hole would look like a motion
-        is_wide = time[following_row] - time[np.clip(previous, 0, None)] > max(
-            _STALE * period, 0.05
-        )
-        return np.where(is_wide, np.nan, out)
-    # a command holds until the next one comes
-    last = np.clip(previous, 0, None)
-    out = np.where(previous >= 0, values[last], np.nan)
-    return np.where(clock - time[last] > max(_STALE * period, 0.1), np.nan, out)
-
-
 def source_of(column: str, entry, path: Path) -> Source:
     """An entry of a `columns.toml`. Raises UserError for an unknown key, column or
     unit.
@@ -404,3 +249,23 @@ def source_of(column: str, entry, path: Path) -> Source:
     if not all(type(n) in (int, float) and math.isfinite(n) for n in numbers):
         raise UserError(f"{path}: scale and offset of {column} must be numbers")
     return Source(entry["from"], UNITS[unit] * numbers[0], float(numbers[1]))
+
+
+def _clock(entry, path: Path) -> Clock:
+    """One of several time stamps. Raises UserError for an unknown column, key or
+    unit.
+    """
+    columns = entry.get("of", []) if isinstance(entry, dict) else []
+    possible = (*LOG_COLUMNS[2:], *EULER)
+    unknown = (
+        [name for name in columns if name not in possible]
+        if isinstance(columns, list)
+        else [columns]
+    )
+    if unknown:
+        raise UserError(
+            f"{path}: a time stamp is `of` {unknown[0]!r}; it must be a list of columns out of "
+            f"{', '.join(possible)}"
+        )
+    rest = {k: v for k, v in entry.items() if k != "of"} if isinstance(entry, dict) else entry
+    return Clock(source_of("t", rest, path), tuple(columns))

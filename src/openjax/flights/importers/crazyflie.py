@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from openjax.flights.importers.columns import ColumnMapping, Stream, merge_streams
+from openjax.flights.importers.columns import ColumnMapping
 from openjax.flights.importers.csv_files import (
     delimiter_of,
     header_of,
@@ -27,6 +27,7 @@ from openjax.flights.importers.firmware import (
     with_mixer,
 )
 from openjax.flights.importers.importer import Importer
+from openjax.flights.importers.streams import Stream, merge_streams
 from openjax.flights.reading import LogError, LogTable
 
 TIME_NAMES = ("timestamp", "tick", "ticks", "time", "time_ms", "timestamp_ms", "t")

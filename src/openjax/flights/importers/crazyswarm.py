@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from openjax.flights.importers.columns import Stream
 from openjax.flights.importers.firmware import with_mixer
+from openjax.flights.importers.streams import Stream
 from openjax.flights.reading import LogError
 
 LOG_TYPE = "crazyflie_interfaces/msg/LogDataGeneric"

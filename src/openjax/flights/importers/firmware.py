@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from openjax.files import read_toml
-from openjax.flights.importers.columns import ColumnMapping, Source, Stream, source_of
+from openjax.flights.importers.columns import ColumnMapping, Source, source_of
+from openjax.flights.importers.streams import Stream
 
 _FILE = Path(__file__).with_name("firmware.toml")
 FIRMWARE_SOURCES = {

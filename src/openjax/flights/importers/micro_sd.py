@@ -19,10 +19,11 @@ from zlib import crc32
 import numpy as np
 
 from openjax.flights.csv_text import LARGEST, LogError
-from openjax.flights.importers.columns import ColumnMapping, Stream, merge_streams
+from openjax.flights.importers.columns import ColumnMapping
 from openjax.flights.importers.csv_files import seconds_per_unit
 from openjax.flights.importers.firmware import are_duty_cycles, firmware_columns, with_mixer
 from openjax.flights.importers.importer import Importer
+from openjax.flights.importers.streams import Stream, merge_streams
 from openjax.flights.reading import LogTable
 
 MAGIC = 0xBC

@@ -19,8 +19,9 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.flights.csv_text import LARGEST, LogError
-from openjax.flights.importers.columns import ColumnMapping, Source, Stream, merge_streams
+from openjax.flights.importers.columns import ColumnMapping, Source
 from openjax.flights.importers.importer import Importer
+from openjax.flights.importers.streams import Stream, merge_streams
 from openjax.flights.reading import LogTable
 
 MAGIC = b"ULog\x01\x12\x35"

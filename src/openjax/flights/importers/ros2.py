@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.flights.importers.columns import EULER, ColumnMapping, Source, Stream, merge_streams
+from openjax.flights.importers.columns import EULER, ColumnMapping, Source
 from openjax.flights.importers.crazyswarm import (
     DEFINITIONS,
     LOG_TYPE,
@@ -27,6 +27,7 @@ from openjax.flights.importers.crazyswarm import (
 )
 from openjax.flights.importers.firmware import firmware_columns
 from openjax.flights.importers.importer import Importer
+from openjax.flights.importers.streams import Stream, merge_streams
 from openjax.flights.reading import CHANNEL_COLUMNS, LogError, LogTable
 
 _POSITION = CHANNEL_COLUMNS["position"]

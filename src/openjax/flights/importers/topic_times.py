@@ -14,14 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from openjax.errors import suggestion
-from openjax.flights.importers.columns import (
-    EULER,
-    ColumnMapping,
-    Source,
-    Stream,
-    merge_streams,
-    with_units,
-)
+from openjax.flights.importers.columns import EULER, ColumnMapping, Source, with_units
 from openjax.flights.importers.csv_files import (
     delimiter_of,
     header_of,
@@ -30,6 +23,7 @@ from openjax.flights.importers.csv_files import (
     seconds_per_unit,
 )
 from openjax.flights.importers.importer import Importer
+from openjax.flights.importers.streams import Stream, merge_streams
 from openjax.flights.reading import LOG_COLUMNS, LONGEST_NAME, LogError, LogTable
 
 SEPARATORS = "./:"
