@@ -53,7 +53,7 @@ def judged(rows, speed=0.0, axis=2, begin=0.3, logged=True):
         position[axis] += way
         velocity[axis] += drift
         told = pose._replace(position=tuple(position), velocity=tuple(velocity))
-        innovations = innovations.update(told, sent, AIRFRAME).feeling(force if logged else None)
+        innovations = innovations.update(told, sent, AIRFRAME, force=force if logged else None)
         if innovations.verdict():
             break
     return innovations, pose

@@ -170,6 +170,14 @@ def turned_on(quaternion, rates: Vector, duration: float) -> tuple[float, float,
     return tuple(q / size for q in turn)
 
 
+def angle_between(a, b) -> float:
+    """The angle (rad) of the rotation between two unit quaternions wxyz."""
+    # the absolute value, since q and -q are one attitude; cut, since rounding may leave
+    # more than 1
+    cosine = abs(sum(p * q for p, q in zip(a, b, strict=True)))
+    return 2.0 * math.acos(min(cosine, 1.0))
+
+
 def wanted_velocity(position: Vector, target: Vector, speed: float) -> Vector:
     """The velocity that leads from `position` to `target`, of at most `speed` (m/s)."""
     velocity = [POSITION_GAIN * (t - p) for t, p in zip(target, position, strict=True)]

@@ -36,7 +36,7 @@ class Episode:
     """A game that is on."""
 
     number: int
-    begun: float  # s
+    start: float  # s
     play: Play  # of its newest tick
 
 
@@ -75,7 +75,7 @@ class Course:
         if modes & UNDERWAY and time - self.since > TRANSFER:
             return Request.LAND, f"not all at their starts after {TRANSFER:g} s"
         if self.episode is not None and (
-            self.episode.play.over or time - self.episode.begun > self._plan.episode_seconds
+            self.episode.play.over or time - self.episode.start > self._plan.episode_seconds
         ):
             self.end_game("over")
             self.since = time

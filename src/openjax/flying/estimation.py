@@ -38,14 +38,14 @@ def _without_drift(state, drone) -> Drone:
     """The drone whose own estimate drifts: none is believed any more in this flight,
     and it is where the last one was, as fast as thrust and drag explain.
     """
-    own = drone.own
-    if own.fault or drone.mode not in AIRBORNE:
+    estimates = drone.own
+    if estimates.fault or drone.mode not in AIRBORNE:
         return drone
-    pose = own.innovations.pose
-    excess = (*own.innovations.drift.totals, 0.0)
+    pose = estimates.innovations.pose
+    excess = (*estimates.innovations.drift.totals, 0.0)
     velocity = tuple(v - part for v, part in zip(pose.velocity, excess, strict=True))
     return drone._replace(
-        own=own._replace(verdict=Verdict.DRIFTS, fault=Verdict.DRIFTS),
+        own=estimates._replace(verdict=Verdict.DRIFTS, fault=Verdict.DRIFTS),
         estimate=moved_on(pose._replace(velocity=velocity), state.time),
     )
 
@@ -58,7 +58,7 @@ def _estimate(state, drone, sample) -> Drone:
         time,
         state.limits,
         state.airframe,
-        sent=drone.sent,
+        command=drone.sent,
         moving=drone.mode in FLYING and not spins_up,
         airborne=drone.mode in AIRBORNE,
     )
@@ -90,53 +90,53 @@ def _with_own(drone, sample, moment, by_capture) -> Drone:
     """The drone after its newest own estimate. `by_capture`: whether it is flown by motion
     capture, which must confirm its own where that was lost or wrong.
     """
-    own = drone.own
-    captured = drone.captured
+    estimates = drone.own
+    capture = drone.captured
     limits = moment.limits
-    is_led = by_capture and own.fresh(moment)
+    is_led = by_capture and estimates.fresh(moment)
     # what it is flown by is motion capture: that says nothing of where its own leads
-    newer = own.update(sample.own, moment, None if is_led else drone.estimate)
-    is_new = newer.pose is not own.pose
-    to_confirm = is_new and by_capture and not is_led and moment.moving and captured.fresh(moment)
-    if to_confirm and not offset_of(captured.pose, newer.pose).is_agreement(limits):
-        newer = newer._replace(pose=own.pose, verdict=Verdict.JUMPED)
+    newer = estimates.update(sample.own, moment, None if is_led else drone.estimate)
+    is_new = newer.pose is not estimates.pose
+    to_confirm = is_new and by_capture and not is_led and moment.moving and capture.fresh(moment)
+    if to_confirm and not offset_of(capture.pose, newer.pose).is_agreement(limits):
+        newer = newer._replace(pose=estimates.pose, verdict=Verdict.JUMPED)
         is_new = False
-    next_own = own.check_motion(newer, moment, sample.force)
+    next_own = estimates.check_motion(newer, moment, sample.force)
     if not is_new:
         # what told nothing but wrong poses until it was lost may tell believable ones,
         # of another place, once anything can have happened
-        is_lost = moment.airborne and not (own.fresh(moment) or captured.fresh(moment))
+        is_lost = moment.airborne and not (estimates.fresh(moment) or capture.fresh(moment))
         return drone._replace(own=next_own._replace(fault=next_own.verdict if is_lost else ""))
     drone = drone._replace(own=next_own)
     # where motion capture tells otherwise than the estimate, it isn't what that followed
     if not next_own.fault or (
-        captured.pose is not None and not offset_of(captured.pose, newer.pose).is_error(limits)
+        capture.pose is not None and not offset_of(capture.pose, newer.pose).is_error(limits)
     ):
         return drone
     # what the estimator on board follows can't confirm it: neither is believed any more,
     # back to where the sums say that the vehicle is
     estimate = moved_on(next_own.innovations.corrected_pose(), moment.time)
-    return drone._replace(estimate=estimate, captured=captured._replace(fault=next_own.fault))
+    return drone._replace(estimate=estimate, captured=capture._replace(fault=next_own.fault))
 
 
 def _with_capture(drone, sample, moment) -> Drone:
     """The drone after the newest of motion capture: whether it is believed, and told to
     the estimator on board.
     """
-    own = drone.own
-    captured = drone.captured
-    pose = with_motion(sample.captured, captured.pose, sample.own)
-    newer = captured.update(pose, moment, drone.estimate)
+    estimates = drone.own
+    capture = drone.captured
+    pose = with_motion(sample.captured, capture.pose, sample.own)
+    newer = capture.update(pose, moment, drone.estimate)
     if newer.pose is pose:
         feeds = True
         # on the ground, or with no pose of its own, there is nothing to compare it with
-        if moment.moving and own.pose is not None:
-            offset = offset_of(pose, own.pose)
+        if moment.moving and estimates.pose is not None:
+            offset = offset_of(pose, estimates.pose)
             feeds = offset.is_error(moment.limits)
-            if own.fresh(moment) and not offset.is_agreement(moment.limits):
-                newer = newer._replace(pose=captured.pose, verdict=Verdict.APART)
+            if estimates.fresh(moment) and not offset.is_agreement(moment.limits):
+                newer = newer._replace(pose=capture.pose, verdict=Verdict.APART)
         drone = drone._replace(feeds_estimator=feeds)
-    newer = captured.check_motion(newer, moment)
+    newer = capture.check_motion(newer, moment)
     if moment.moving and not newer.fault and not newer.fresh(moment):
         newer = newer._replace(fault=newer.verdict or "pose lost")
     return drone._replace(captured=newer)

@@ -89,7 +89,8 @@ class Innovations(NamedTuple):
     recent: Vector = ZERO  # m/s, world: the same, remembered for longer
     turn: Vector = ZERO  # rad, body
     rate: Vector = ZERO  # rad/s, body
-    bias: Vector = ZERO  # m/s^2, world: what thrust and attitude don't explain
+    # m/s^2, world: what thrust and attitude don't explain: drag, wind, an unknown weight
+    bias: Vector = ZERO
     age: float = 0.0  # s, for how long that is learnt
     thrust: float = 0.0  # share of the maximum that the motors have reached
     rates: Vector = ZERO  # rad/s, that the rate loop should have reached
@@ -99,27 +100,32 @@ class Innovations(NamedTuple):
     climb: Climb = Climb()
 
     def update(
-        self, pose: Pose, command: SetPoint, airframe: Airframe, is_refused: bool = False
+        self,
+        pose: Pose,
+        command: SetPoint,
+        airframe: Airframe,
+        is_refused: bool = False,
+        force: Vector | None = None,
     ) -> "Innovations":
         """With the next pose; `command` has acted since the last one.
 
-        `is_refused`: whether poses between them came and weren't believed. Then this
-        one must follow from the last believable one, however long that is ago.
+        Args:
+          is_refused: whether poses between them came and weren't believed. Then this
+          one must follow from the last believable one, however long that is ago.
+          force: specific force (m/s^2, body) that the accelerometer feels at the pose;
+          None: it isn't known.
         """
         last = self.pose
+        climb = self.climb.update(pose, force)
         longest = math.inf if is_refused else LONGEST
         if last is None or not 0.0 < pose.time - last.time <= longest:
-            return self._replace(pose=pose, thrust=command.thrust, rates=pose.body_rates)
+            return self._restart(pose, command, climb)
         dt = pose.time - last.time
         thrust, rates = self._response(pose, command, airframe, dt)
         # the trapezoidal rule: exact for an acceleration that stays
         mean = _towards(last.velocity, pose.velocity, 0.5)
         way = _difference(_difference(pose.position, last.position), _times(dt, mean))
-        lift = lift_acceleration(pose.quaternion, thrust / airframe.hover_thrust)
-        gain = _times(1.0 / dt, _difference(pose.velocity, last.velocity))
-        # the bias is what thrust has not explained so far: drag, wind, an unknown
-        # weight
-        beyond_thrust = _difference(gain, lift)
+        beyond_thrust = _beyond_thrust(last, pose, thrust, airframe)
         residual = _difference(beyond_thrust, self.bias)
         step = _times(dt, residual)
         turn = _turn_beyond_gyroscope(last, pose)
@@ -138,8 +144,12 @@ class Innovations(NamedTuple):
             thrust=thrust,
             rates=rates,
             drift=self.drift.update(beyond_thrust, mean, dt),
-            climb=self.climb,
+            climb=climb,
         )
+
+    def _restart(self, pose, command, climb):
+        """The same sums, to go on from a pose that doesn't follow from the last one."""
+        return self._replace(pose=pose, thrust=command.thrust, rates=pose.body_rates, climb=climb)
 
     def _response(self, pose, command, airframe, dt):
         """Thrust and body rates that motors and rate loop have made of a command after
@@ -153,12 +163,6 @@ class Innovations(NamedTuple):
             else pose.body_rates
         )
         return thrust, _towards(self.rates, request, _share(dt, RATE_LAG))
-
-    def feeling(self, force: Vector | None) -> "Innovations":
-        """With the specific force (m/s^2, body) that the accelerometer feels at the
-        newest pose; None: it isn't known.
-        """
-        return self._replace(climb=self.climb.update(self.pose, force))
 
     def corrected_pose(self) -> Pose:
         """The newest pose without what was summed up: where the vehicle is if what it
@@ -204,6 +208,15 @@ def turn_between(start: Sequence[float], end: Sequence[float]) -> Vector:
         sign * (a * y + b * z - c * w - d * x),
         sign * (a * z - b * y + c * x - d * w),
     )
+
+
+def _beyond_thrust(last: Pose, pose: Pose, thrust: float, airframe: Airframe) -> Vector:
+    """The acceleration (m/s^2, world) from one pose to the next that a thrust at the
+    latter's attitude doesn't explain.
+    """
+    lift = lift_acceleration(pose.quaternion, thrust / airframe.hover_thrust)
+    gain = _times(1.0 / (pose.time - last.time), _difference(pose.velocity, last.velocity))
+    return _difference(gain, lift)
 
 
 def _turn_beyond_gyroscope(last: Pose, pose: Pose) -> Vector:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from openjax.flying.controller import Pose, moved_on, numbers_of
+from openjax.flying.controller import Pose, angle_between, moved_on, numbers_of
 
 
 class Verdict(StrEnum):
@@ -153,11 +153,3 @@ def offset_of(capture: Pose, estimate: Pose) -> Offset:
         math.dist(capture.position, estimate.position),
         angle_between(capture.quaternion, estimate.quaternion),
     )
-
-
-def angle_between(a, b) -> float:
-    """The angle (rad) of the rotation between two unit quaternions wxyz."""
-    # the absolute value, since q and -q are one attitude; cut, since rounding may leave
-    # more than 1
-    cosine = abs(sum(p * q for p, q in zip(a, b, strict=True)))
-    return 2.0 * math.acos(min(cosine, 1.0))

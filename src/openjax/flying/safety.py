@@ -13,7 +13,6 @@ Troubles: its pose is lost, its link is silent, its battery low, it is too fast,
 tilted, or outside the arena; no action came in time; a key.
 """
 
-import functools
 import math
 
 from openjax.flying.controller import Vector, up
@@ -59,9 +58,9 @@ def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
     else:
         # the clock of the actions starts with the game
         action_time = time
-    drones = _react(state, drones, troubles)
-    watched = tuple(map(functools.partial(_watch, state), drones, event.samples))
-    state = state._replace(drones=watched, action_time=action_time)
+    reactions = zip(_react(state, drones, troubles), event.samples, strict=True)
+    drones = tuple(_watch(state, drone, sample) for drone, sample in reactions)
+    state = state._replace(drones=drones, action_time=action_time)
     next_drones = tuple(steer(state, i, actions[i] if finite else None) for i in range(len(drones)))
     return state._replace(drones=next_drones), tuple(drone.sent for drone in next_drones)
 

@@ -24,7 +24,7 @@ class Moment(NamedTuple):
     time: float  # s
     limits: PoseLimits
     airframe: Airframe
-    sent: SetPoint  # the last, which has acted since
+    command: SetPoint  # the last that was sent, which has acted since
     moving: bool  # whether it may have left the place where it stood
     airborne: bool  # whether nothing but air carries it: then thrust tells its acceleration
 
@@ -69,15 +69,15 @@ class Source(NamedTuple):
         """`newer`, which is this source after a pose, with that pose's innovations; without
         the pose, and not to be believed any more, if they contradict physics.
 
-        `force`: of the accelerometer, see `Innovations.feeling`.
+        `force`: of the accelerometer, see `Innovations.update`.
         """
         if not moment.airborne:
             return newer._replace(innovations=Innovations())
         if newer.pose is self.pose:
             return newer
         innovations = self.innovations.update(
-            newer.pose, as_sent(moment.sent), moment.airframe, is_refused=bool(self.verdict)
-        ).feeling(force)
+            newer.pose, as_sent(moment.command), moment.airframe, bool(self.verdict), force
+        )
         fault = innovations.verdict()
         if fault:
             newer = newer._replace(pose=self.pose, verdict=fault, fault=fault)
