@@ -1,5 +1,5 @@
-"""One manner for all studies: measure, store what was found as JSON, make the page from
-what is stored.
+"""One manner for all studies: measure, store what was found as JSON, make the page from what is
+stored.
 
     from experiments.table import Page, Table, page_parser, publish
 
@@ -13,9 +13,8 @@ what is stored.
 
     publish(page_parser(__doc__, "vehicles").parse_args(arguments), study, page)
 
-`--report` prints every table of what is stored. A page of results has one of them,
-between two marks, in words that somebody wrote: those stay, and the table between the
-marks is made anew.
+`--report` prints every table of what is stored. A page of results has one of them, between two
+marks, in words that somebody wrote: those stay, and the table between the marks is made anew.
 """
 
 import argparse
@@ -73,11 +72,9 @@ class Table:
 
 @dataclass(frozen=True)
 class Page:
-    """A title, what was done in words, then tables or paragraphs: all that a study
-    prints.
+    """A title, what was done in words, then tables or paragraphs: all that a study prints.
 
-    `table` is the one of at most ten rows that stands on the page of results; by
-    default the first.
+    `table` is the one of at most ten rows that stands on the page of results; by default the first.
     """
 
     title: str
@@ -90,9 +87,7 @@ class Page:
         return [self.parts] if isinstance(self.parts, Table | str) else self.parts
 
     def rows(self) -> list[str]:
-        """The Markdown of the one table that stands between the marks of the page of
-        results.
-        """
+        """The Markdown of the one table that stands between the marks of the page of results."""
         columns = self.table or next(part for part in self.all_parts() if isinstance(part, Table))
         return Table(columns.columns, columns.records).lines()
 
@@ -146,9 +141,7 @@ def made(facts: Mapping) -> str:
 
 
 def page_parser(doc: str | None, name: str) -> argparse.ArgumentParser:
-    """A parser with `--report`, `--commit` and, by default for the page `name`,
-    `--out`.
-    """
+    """A parser with `--report`, `--commit` and, by default for the page `name`, `--out`."""
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -159,9 +152,7 @@ def page_parser(doc: str | None, name: str) -> argparse.ArgumentParser:
 
 
 def typed_command() -> str:
-    """The command that runs, as one types it, without the places of its work and its
-    results.
-    """
+    """The command that runs, as one types it, without the places of its work and its results."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     name = spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).name
     words = iter(sys.argv[1:])
@@ -207,11 +198,9 @@ def write_page(
     results: Any,
     draw: Callable[[Any, Path], None] | None = None,
 ) -> None:
-    """Print the report of `results`, write its page, and draw its figure if there is
-    one.
+    """Print the report of `results`, write its page, and draw its figure if there is one.
 
-    A page whose table stands between the marks keeps its words; any other becomes the
-    report.
+    A page whose table stands between the marks keeps its words; any other becomes the report.
     """
     content = page(results)
     report = "\n".join(content.lines(results)) + "\n"

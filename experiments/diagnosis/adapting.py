@@ -82,9 +82,7 @@ class Flown:
 
 
 def diagnosed(job: tuple[int, Path]) -> dict:
-    """Diagnose a vehicle's flights twice and write down what a simulator would be
-    told.
-    """
+    """Diagnose a vehicle's flights twice and write down what a simulator would be told."""
     from openjax.gap.diagnosis import diagnose_case
     from openjax.gap.report.writing import to_fly
     from openjax.vehicle.effects import save_effects
@@ -185,9 +183,7 @@ def bounds_in(folder: Path, name: str):
 
 
 def losing(nominal: dict, before: dict) -> list[str]:
-    """The losses that a vehicle has beyond chance, by the same episodes with the
-    nominal one.
-    """
+    """The losses that a vehicle has beyond chance, by the same episodes with the nominal one."""
     found = []
     for name in LOSSES:
         loss = np.asarray(before[name], float) - np.asarray(nominal[name], float)
@@ -248,9 +244,7 @@ def shares(vehicles: list[dict], name: str) -> dict:
 
 
 def report(vehicles: list[dict]) -> dict:
-    """The figures of all vehicles; those whose cause was found first stand by
-    themselves.
-    """
+    """The figures of all vehicles; those whose cause was found first stand by themselves."""
     losers = [v for v in vehicles if v["loses"]]
     right = [v for v in losers if (v["found"]["named"] or [""])[0] == v["cause"]]
     return {
@@ -263,9 +257,7 @@ def report(vehicles: list[dict]) -> dict:
 
 
 def tune(options) -> None:
-    """Fine-tune and fly part of the vehicles; each is written as soon as it is
-    there.
-    """
+    """Fine-tune and fly part of the vehicles; each is written as soon as it is there."""
     from openjax.runs.machine import describe_machine
     from openjax.store.compiled_programs import cache_programs
 

@@ -138,19 +138,17 @@ def scale_stands_in(fleet, i, name, squares, floor):
             [forces.motor_demand(p, active, *now) for now in zip(m, voltage, load, strict=True)]
         )
     true, plain = np.array(demands)
-    # on the command, so that the rotors' speeds at the start of a window are those that
-    # flew
+    # on the command, so that the rotors' speeds at the start of a window are those that flew
     without["curve_map"][1, c] *= (true * plain).sum() / (plain**2).sum()
     left = fleet.replayed(i, without)[FORCE] - squares["truth"][FORCE]
     return bool(np.sqrt(np.maximum(left, 0.0) / floor[FORCE] ** 2).max() < HIDDEN)
 
 
 def accepted(name, weighed, shows=None, scale=False):
-    """Names that are right for a cause: those that such flights can't tell apart from
-    it.
+    """Names that are right for a cause: those that such flights can't tell apart from it.
 
-    `shows` (12,): what the cause shows in each channel, in floors; `scale`: a constant
-    factor on the thrust stands in.
+    `shows` (12,): what the cause shows in each channel, in floors; `scale`: a constant factor on
+    the thrust stands in.
     """
     shows = np.full(12, np.inf) if shows is None else shows
     out = [name]

@@ -1,8 +1,7 @@
-"""The physics of a batch of vehicles, a millisecond a step: rotors, forces, rigid body
-and battery.
+"""The physics of a batch of vehicles, a millisecond a step: rotors, forces, rigid body and battery.
 
-Integration is semi-implicit with a second-order position; Euler angles appear nowhere.
-Arrays have the body index last.
+Integration is semi-implicit with a second-order position; Euler angles appear nowhere. Arrays have
+the body index last.
 """
 
 import numpy as np

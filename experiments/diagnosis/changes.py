@@ -37,9 +37,7 @@ NORMAL = ("normal_flight", "reference")
 
 
 def record_of(vehicle: str, condition: str, truth: dict, answer: Report | Change) -> dict:
-    """One comparison: what was done, and what was said by the diagnosis or by trims
-    alone.
-    """
+    """One comparison: what was done, and what was said by the diagnosis or by trims alone."""
     out = {"vehicle": vehicle, "condition": condition, "truth": truth}
     if isinstance(answer, Report) and not answer.named and answer.change_by_trims is not None:
         answer = answer.change_by_trims
@@ -79,9 +77,7 @@ def sample_records(work: Path, seeds: list[int]) -> list[dict]:
 
 
 def vehicle_records(name: str, folder: Path, labels: dict) -> list[dict]:
-    """Each condition against all normal flights, each day of these against the
-    others.
-    """
+    """Each condition against all normal flights, each day of these against the others."""
     (normal,) = [n for n in NORMAL if (folder / n).is_dir()]
     case, old, _ = read(read_folder(folder / normal))
     out = []

@@ -1,13 +1,12 @@
-"""Does the advised flight tell more than a random one? Two hovers that say little, a
-diagnosis, its advice, the advised segments flown, the next diagnosis, twice; beside it
-as many random segments.
+"""Does the advised flight tell more than a random one? Two hovers that say little, a diagnosis, its
+advice, the advised segments flown, the next diagnosis, twice; beside it as many random segments.
 
     python -m experiments.diagnosis.closed_loop --cases 48 --jobs 32 --out
     experiments/results/closed_loop.json
 
-The plant is openjax' own vehicle with one effect of its sample strength, so this asks
-for the advice, not for the diagnosis' strength on foreign vehicles. `--each` also
-diagnoses the hovers with each segment alone: which segment shows which cause.
+The plant is openjax' own vehicle with one effect of its sample strength, so this asks for the
+advice, not for the diagnosis' strength on foreign vehicles. `--each` also diagnoses the hovers with
+each segment alone: which segment shows which cause.
 """
 
 import argparse
@@ -70,9 +69,7 @@ def described():
 
 
 def diagnose(flights: list, cause: str) -> tuple[dict, dict]:
-    """What is kept of a diagnosis of a vehicle with one cause, and its report as JSON
-    has it.
-    """
+    """What is kept of a diagnosis of a vehicle with one cause, and its report as JSON has it."""
     from openjax.flights import flight
     from openjax.gap.diagnosis import diagnose_case
 
@@ -148,9 +145,7 @@ def studied(job: tuple[int, str]) -> tuple[int, dict]:
 
 
 def study(numbers: list[int], jobs: int, each: bool) -> list[dict]:
-    """All cases. The longest jobs begin first, so that none is waited for at the
-    end.
-    """
+    """All cases. The longest jobs begin first, so that none is waited for at the end."""
     parts = ["advised", "random", *(segment_names() if each else ())]
     work = [(number, part) for part in parts for number in numbers]
     cases: dict[int, dict] = {n: {"number": n, "cause": Case(n).cause} for n in numbers}

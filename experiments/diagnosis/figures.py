@@ -33,9 +33,7 @@ FIGURES = {
 
 
 def calibration_error(pairs: list, bins: int = 10) -> float:
-    """Expected calibration error of (stated probability, whether true): nan without
-    data.
-    """
+    """Expected calibration error of (stated probability, whether true): nan without data."""
     if not pairs:
         return math.nan
     p, hit = np.array(pairs, float).T

@@ -1,5 +1,4 @@
-"""The firmware's rate loop at 500 Hz: filters of gyroscope and derivative, PID in
-counts, mixer.
+"""The firmware's rate loop at 500 Hz: filters of gyroscope and derivative, PID in counts, mixer.
 
 Arrays have the body index last.
 """

@@ -80,14 +80,11 @@ class Fleet:
         if wakes_from is not None:
             batch.wakes_from = wakes_from
         self.flown = plant.fly(batch)
-        # What is measured is what the logs cover: a fault that comes after their end
-        # shows nothing.
+        # What is measured is what the logs cover: a fault that comes after their end shows nothing.
         self.seen = self.flown | {"crashed": np.minimum(self.flown["crashed"], logged)}
 
     def model(self, causes_of, arrival=None):
-        """Parameters with the nuisances and these causes; unknown causes and magnitudes
-        beside.
-        """
+        """Parameters with the nuisances and these causes; unknown causes and magnitudes beside."""
         p = vehicle.nominal_parameters(self.told)
         strangers = {}
         magnitudes = []
@@ -174,9 +171,7 @@ class Fleet:
 
 
 def write_flight(path, vehicles, channels):
-    """One gzipped CSV file in the format of the flight logs; the same rows give the
-    same bytes.
-    """
+    """One gzipped CSV file in the format of the flight logs; the same rows give the same bytes."""
     columns = [c for g in "psgacmv" if g in channels for c in sensors.GROUPS[g]]
     lines = []
     line = ",".join(f"%.{sensors.DECIMALS[c]}f" for c in columns)

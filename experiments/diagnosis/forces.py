@@ -59,9 +59,7 @@ def motor_demand(p, active, m, voltage, load):
 
 
 def surface_gain(p, active, position, q):
-    """Thrust factor of each rotor (4, B) near the floor and the ceiling; 1 where
-    neither acts.
-    """
+    """Thrust factor of each rotor (4, B) near the floor and the ceiling; 1 where neither acts."""
     sides = [s for s in ("ground", "ceiling") if active(s + "_image", s + "_exp", s + "_inverse")]
     if not sides:
         return 1.0
@@ -118,8 +116,7 @@ def air_forces(p, active, q, velocity, rates, speed, thrust, position, gust):
         norm = np.sqrt((vb * vb).sum(axis=0))
         force -= p["drag_quadratic"] * norm * vb * np.array([1.0, 1.0, 0.6])[:, None]
     if active("drag_rotor"):
-        # in-plane force at each hub, proportional to rotor speed and the hub's own
-        # velocity
+        # in-plane force at each hub, proportional to rotor speed and the hub's own velocity
         c = p["drag_rotor"] * speed / MAX_SPEED
         x = ROTOR_X[:, None]
         y = ROTOR_Y[:, None]

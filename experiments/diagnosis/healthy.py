@@ -1,9 +1,8 @@
-"""Reference flights of a case: the same vehicle on another day, with nothing wrong with
-it.
+"""Reference flights of a case: the same vehicle on another day, with nothing wrong with it.
 
-A day moves the trims of a vehicle by 1 to 2.5 % of hover (batteries, propellers, how
-the frame was put together; measured on published flights of two Crazyflies), its
-battery's charge and the biases of its sensors. Everything else is the vehicle's own.
+A day moves the trims of a vehicle by 1 to 2.5 % of hover (batteries, propellers, how the frame was
+put together; measured on published flights of two Crazyflies), its battery's charge and the biases
+of its sensors. Everything else is the vehicle's own.
 """
 
 import numpy as np

@@ -1,12 +1,11 @@
 """How a drawn cause is written into the plant's parameters, an effect a function.
 
-A cause is {"effect", "form", "size", "shape"}: `size` is the one number that decides
-the severity, `shape` are eight uniform draws that fix everything else (signs, axes,
-ratios), once per case. The first form of an effect is close to what any library would
-write; the others are not.
+A cause is {"effect", "form", "size", "shape"}: `size` is the one number that decides the severity,
+`shape` are eight uniform draws that fix everything else (signs, axes, ratios), once per case. The
+first form of an effect is close to what any library would write; the others are not.
 
-Each function changes the parameters `p` of the bodies `c` in place and returns the
-magnitudes in the units of the parameter tables: kg, N s/m, m/s, ms, mm, shares.
+Each function changes the parameters `p` of the bodies `c` in place and returns the magnitudes in
+the units of the parameter tables: kg, N s/m, m/s, ms, mm, shares.
 """
 
 from typing import NamedTuple
@@ -93,8 +92,7 @@ def thrust_saturation(cause, p, c):
 def thrust_curve(cause, p, c):
     """The map from command to thrust bends."""
     if cause.form == "quadratic":
-        # zero at hover and at a second thrust: the curvature is the cause, not the
-        # scale
+        # zero at hover and at a second thrust: the curvature is the cause, not the scale
         p["curve_quadratic"][c] = cause.sign * cause.size
         p["curve_root"][c] = p["hover"][c] - 0.28 + 0.2 * cause.shape[1]
         return {"curvature": cause.sign * cause.size}
@@ -111,9 +109,7 @@ def thrust_curve(cause, p, c):
 
 
 def rotor_drag(cause, p, c):
-    """Force against the velocity, by several laws; the size is its level
-    coefficient.
-    """
+    """Force against the velocity, by several laws; the size is its level coefficient."""
     a = cause.size
     ratio = 0.3 + 0.6 * cause.shape[1]
     values = {"d_xy": a, "d_z": a * ratio}
@@ -185,9 +181,7 @@ def surface_effect(cause, p, c, side):
 
 
 def downwash(cause, p, c):
-    """The wake of a vehicle above; the size is its force in thousandths of the weight
-    of 1 kg.
-    """
+    """The wake of a vehicle above; the size is its force in thousandths of the weight of 1 kg."""
     p["wake"][c] = cause.size * 1e-3 * GRAVITY
     p["wake_width"][c] = 0.02 * 7.5 ** cause.shape[1]
     p["wake_spread"][c] = 0.12 * cause.shape[2]
@@ -212,8 +206,7 @@ def motor_lag(cause, p, c):
         up = 1 + a * (0.5 + 0.4 * cause.shape[1])
         down = 1 + a * (1.1 + 0.6 * cause.shape[2])
     if cause.form == "brushed":
-        # as measured on real ones: several times slower, differently up and down, 5 ms
-        # late
+        # as measured on real ones: several times slower, differently up and down, 5 ms late
         up = 1 + a * (0.75 + 0.1 * cause.shape[1])
         down = 1 + a * (1.0 + 0.2 * cause.shape[2])
         p["tau_second"][c] = 0.004 + 0.002 * cause.shape[3]
@@ -252,9 +245,7 @@ def com_offset(cause, p, c):
 
 
 def inertia(cause, p, c):
-    """Moments of inertia of their own, mostly larger; or with a product between x and
-    y.
-    """
+    """Moments of inertia of their own, mostly larger; or with a product between x and y."""
     factors = 1 + cause.size * (0.6 + 0.4 * cause.shape[1:4])
     factors = factors if cause.shape[0] < 0.7 else 1 / factors
     if cause.form == "products":
@@ -266,9 +257,7 @@ def inertia(cause, p, c):
 
 
 def yaw_torque(cause, p, c):
-    """The rotors' reaction: mostly below the nominal, down to .15; sometimes above, up
-    to 2.
-    """
+    """The rotors' reaction: mostly below the nominal, down to .15; sometimes above, up to 2."""
     factor = 1 - cause.size if cause.shape[0] < 0.7 else 1 + cause.size
     p["torque_ratio"][c] *= factor
     return {"ratio": factor}

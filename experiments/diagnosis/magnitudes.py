@@ -60,11 +60,10 @@ TRUTH = {
 
 
 def parameters(answer, report):
-    """[{"effect", "error", "covered"}] of the true causes whose parameters the report
-    gives.
+    """[{"effect", "error", "covered"}] of the true causes whose parameters the report gives.
 
-    The error is |estimate - truth| / |truth - absent|, vectors taken as one; surface
-    effects and wakes are compared as what they do at one distance.
+    The error is |estimate - truth| / |truth - absent|, vectors taken as one; surface effects and
+    wakes are compared as what they do at one distance.
     """
     said = (report or {}).get("parameters") or {}
     rows = []

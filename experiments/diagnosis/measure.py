@@ -1,16 +1,15 @@
 """How much an effect shows, by the plant's own measure.
 
-The vehicle is replayed along the true motion in short windows, driven by the motor
-commands that it got: the change of velocity over 0.25 s (force, body axes) and of the
-body rates over 0.05 s (torque), with the true position, attitude, velocity and rates at
-every step and the model's own rotors. The firmware is run along the true gyroscope and
-the commands as issued: motor commands (roll, pitch, yaw), without what is slower than
-half a second. The turn of the pose over 0.1 s is set against the body rates. Errors are
-divided by the case's noise floor: what is left with the true model when the logged
-motor commands drive it (turbulence, and rows that see little of the motors) together
-with what the case's sensors add over the same horizons. A channel that the logs do not
-hold has no finite floor. Severity is the largest ratio of a channel; energies are mean
-squares in floors.
+The vehicle is replayed along the true motion in short windows, driven by the motor commands that it
+got: the change of velocity over 0.25 s (force, body axes) and of the body rates over 0.05 s
+(torque), with the true position, attitude, velocity and rates at every step and the model's own
+rotors. The firmware is run along the true gyroscope and the commands as issued: motor commands
+(roll, pitch, yaw), without what is slower than half a second. The turn of the pose over 0.1 s is
+set against the body rates. Errors are divided by the case's noise floor: what is left with the true
+model when the logged motor commands drive it (turbulence, and rows that see little of the motors)
+together with what the case's sensors add over the same horizons. A channel that the logs do not
+hold has no finite floor. Severity is the largest ratio of a channel; energies are mean squares in
+floors.
 """
 
 import numpy as np

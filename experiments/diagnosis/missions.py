@@ -1,10 +1,8 @@
-"""Reference trajectories of the exam's plants: what the off-board controller is asked
-to fly.
+"""Reference trajectories of the exam's plants: what the off-board controller is asked to fly.
 
-A mission is sampled at 100 Hz. Positions are drawn as way-points or closed curves and
-smoothed with a Gaussian, whose derivatives give the velocity and acceleration that the
-controller feeds forward. All missions stay inside the arena (radius 0.9 m, height 1.2
-m).
+A mission is sampled at 100 Hz. Positions are drawn as way-points or closed curves and smoothed with
+a Gaussian, whose derivatives give the velocity and acceleration that the controller feeds forward.
+All missions stay inside the arena (radius 0.9 m, height 1.2 m).
 """
 
 import numpy as np
@@ -28,9 +26,7 @@ def _held(rng, knots, length, spacing):
 
 
 def _curve(rng, t, speed, radius):
-    """Ellipse or figure of eight in the plane, at about `speed` (m/s), fading in over
-    1.5 s.
-    """
+    """Ellipse or figure of eight in the plane, at about `speed` (m/s), fading in over 1.5 s."""
     rate = speed / radius * rng.choice([-1.0, 1.0])
     phase = rate * t * np.clip(t / 3.0, 0.5, 1.0)
     fade = np.clip(t / 1.5, 0.0, 1.0)

@@ -29,8 +29,7 @@ class Batch:
     told: list  # B `vehicle.Told`
     parameters: dict  # arrays of `vehicle.nominal_parameters`
     reference: (
-        # position, velocity, acceleration (K, 3, B), yaw, yaw_rate (K, B), pulses (K,
-        # 4, B)
+        # position, velocity, acceleration (K, 3, B), yaw, yaw_rate (K, B), pulses (K, 4, B)
         dict
     )
     controllers: list  # B names
@@ -41,15 +40,12 @@ class Batch:
     air: dict  # see `sensors.draw_air`
     # site -> [(columns, cause), …], see `unknowns`
     unknowns: dict = field(default_factory=dict)
-    # (positions (3, B) below, positions (3, B) of those above) -> where the wakes seem
-    # to come from
+    # (positions (3, B) below, positions (3, B) of those above) -> where the wakes seem to come from
     wakes_from: Callable = lambda below, above: above
 
 
 def received(arrival, steps):
-    """(steps, B) index of the newest command that has arrived by each ms; -1 before the
-    first.
-    """
+    """(steps, B) index of the newest command that has arrived by each ms; -1 before the first."""
     ticks, count = arrival.shape
     table = np.full((steps, count), -1, dtype=np.int32)
     columns = np.arange(count)
@@ -193,13 +189,12 @@ class Flight:
 
 
 def fly(batch):
-    """Fly the batch: dict of true signals every 2 ms, (S, n, B) float32, and commands
-    (K, 4, B) as issued.
+    """Fly the batch: dict of true signals every 2 ms, (S, n, B) float32, and commands (K, 4, B) as
+    issued.
 
-    `gyro` is the firmware's gyroscope (bias, noise, filter), `applied` the command in
-    force, `motor` what the firmware asks for in the 2 ms from that sample on; `voltage`
-    (S, B); `crashed` (B,) sample of the first breach (floor, ceiling, tilt above 85
-    degrees, 2.5 m away), S if none.
+    `gyro` is the firmware's gyroscope (bias, noise, filter), `applied` the command in force,
+    `motor` what the firmware asks for in the 2 ms from that sample on; `voltage` (S, B); `crashed`
+    (B,) sample of the first breach (floor, ceiling, tilt above 85 degrees, 2.5 m away), S if none.
     """
     p = batch.parameters
     reference = batch.reference

@@ -1,9 +1,8 @@
-"""Flights of body rates alone, with known truth: what an identification of the torques
-is tried on.
+"""Flights of body rates alone, with known truth: what an identification of the torques is tried on.
 
-A rate loop at 500 Hz (the firmware's gains) around rigid-body rates at 1 kHz, in NumPy,
-many flights at once. Commands wander; a coloured torque pushes (gusts); the gyroscope
-is noisy. Nothing of it is openjax' code.
+A rate loop at 500 Hz (the firmware's gains) around rigid-body rates at 1 kHz, in NumPy, many
+flights at once. Commands wander; a coloured torque pushes (gusts); the gyroscope is noisy. Nothing
+of it is openjax' code.
 """
 
 from dataclasses import dataclass
@@ -68,9 +67,7 @@ class Plant:
         self.steps = 0
 
     def step(self, motors: np.ndarray, gust: np.ndarray):
-        """One millisecond under motor commands (4, B); `gust` (3, B) standard
-        normal.
-        """
+        """One millisecond under motor commands (4, B); `gust` (3, B) standard normal."""
         size = len(self.sent)
         self.sent[self.steps % size] = motors
         target = np.sqrt(self.sent[(self.steps - self.late) % size, :, self.every].T)
@@ -89,9 +86,7 @@ class Plant:
 
 
 def fly(truths: list[Truth], seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """Gyroscope (B, N, 3) rad/s and motor commands (B, N, 4) of every cycle of the rate
-    loop.
-    """
+    """Gyroscope (B, N, 3) rad/s and motor commands (B, N, 4) of every cycle of the rate loop."""
     count = round(seconds / TICK)
     draws = [np.random.default_rng(t.seed) for t in truths]
 
@@ -123,9 +118,7 @@ def fly(truths: list[Truth], seconds: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rows_of(gyroscope: np.ndarray, motors: np.ndarray, rate: int, samples: bool):
-    """One flight's rows (T, 3) and (T, 4) at `rate` Hz: motors as means over rows, or
-    `samples`.
-    """
+    """One flight's rows (T, 3) and (T, 4) at `rate` Hz: motors as means over rows, or `samples`."""
     every = round(1.0 / rate / TICK)
     count = len(motors) // every * every
     rows = motors[:count].reshape(-1, every, 4)

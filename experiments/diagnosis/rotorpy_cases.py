@@ -1,15 +1,13 @@
-"""Cases flown in somebody else's simulator: RotorPy 3 (Folk, Paulos, Kumar 2023), the
-`dev` extra.
+"""Cases flown in somebody else's simulator: RotorPy 3 (Folk, Paulos, Kumar 2023), the `dev` extra.
 
     python -m experiments.diagnosis.rotorpy_cases --seed 101 --each 4 --logs LOGS --answers
     ANSWERS.json [--jobs 8]
 
-Rigid body, rotors, hub drag, parasitic drag, flapping moment, translational lift, motor
-lag, wind, the controller (SE3Control, motor speeds at 250 Hz from the measured state)
-and the trajectories are RotorPy's; the told vehicles, the sensors of the known column
-and the measure of severity are the exam's. There are no body-rate commands. RotorPy's
-flapping coefficient is taken negative: with its sign convention a positive one pitches
-the nose down in forward flight, against what flapping does.
+Rigid body, rotors, hub drag, parasitic drag, flapping moment, translational lift, motor lag, wind,
+the controller (SE3Control, motor speeds at 250 Hz from the measured state) and the trajectories are
+RotorPy's; the told vehicles, the sensors of the known column and the measure of severity are the
+exam's. There are no body-rate commands. RotorPy's flapping coefficient is taken negative: with its
+sign convention a positive one pitches the nose down in forward flight, against what flapping does.
 """
 
 from dataclasses import replace

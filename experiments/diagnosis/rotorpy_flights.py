@@ -92,9 +92,7 @@ def trajectory(name, rng, slower=1.0):
 
 
 def fly(told, changed, wind, path, drawn, air):
-    """One flight in RotorPy as `plant.fly` would give it: dict of (S, n, 1) arrays
-    every 2 ms.
-    """
+    """One flight in RotorPy as `plant.fly` would give it: dict of (S, n, 1) arrays every 2 ms."""
     from rotorpy.controllers.quadrotor_control import SE3Control
     from rotorpy.vehicles.multirotor import Multirotor
 

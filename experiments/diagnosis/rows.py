@@ -18,9 +18,7 @@ def at(signal, times):
 
 
 def _through(cut, signal):
-    """A (S, n) signal through the second-order low-pass of `cut` Hz, started in
-    rest.
-    """
+    """A (S, n) signal through the second-order low-pass of `cut` Hz, started in rest."""
     if not cut:
         return signal
     low = butter(2, cut, fs=1 / SAMPLE)
@@ -28,9 +26,7 @@ def _through(cut, signal):
 
 
 def _pose(rng, sensors, flown, j, times, delay):
-    """Position, orientation, velocity (n, 10) of the motion capture at its own
-    `times`.
-    """
+    """Position, orientation, velocity (n, 10) of the motion capture at its own `times`."""
     size = sensors["size"]
     n = len(times)
     step = float(np.median(np.diff(times)))
@@ -132,8 +128,7 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
     if "unknown_attitude" in wrong:
         pose[:, 3:7] = unknowns.turned(pose[:, 3:7], wrong["unknown_attitude"])
 
-    # IMU: the firmware's gyroscope, and the accelerometer with its own noise, vibration
-    # and filter
+    # IMU: the firmware's gyroscope, and the accelerometer with its own noise, vibration and filter
     tilt = np.array(sensors["tilt"])
     gyro = flown["gyro"][:, :, j].astype(float)
     accel = flown["specific"][:, :, j].astype(float)

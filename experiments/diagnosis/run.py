@@ -1,15 +1,14 @@
-"""The exam from end to end: cases are drawn and flown, their answers sealed, the logs
-diagnosed, the answers opened.
+"""The exam from end to end: cases are drawn and flown, their answers sealed, the logs diagnosed,
+the answers opened.
 
     python -m experiments.diagnosis.run --columns stranger=120 rotorpy=2 --seed 1201 --cores 24
     --work DIR --out PAGE
 
-A column is `known`, `real` or `stranger` with a number of cases, or `rotorpy` with a
-number of cases of each kind. `--sets DIR[=ANSWERS]` takes folders of cases that are
-there already. The digest of the answers is written before the first diagnosis. A column
-whose answers lie in the work folder isn't flown again, and cases that are diagnosed
-aren't again. `--report` makes the page anew from what is stored. Seeds below 1000 are
-for development; each other seed is answered once.
+A column is `known`, `real` or `stranger` with a number of cases, or `rotorpy` with a number of
+cases of each kind. `--sets DIR[=ANSWERS]` takes folders of cases that are there already. The digest
+of the answers is written before the first diagnosis. A column whose answers lie in the work folder
+isn't flown again, and cases that are diagnosed aren't again. `--report` makes the page anew from
+what is stored. Seeds below 1000 are for development; each other seed is answered once.
 """
 
 import math
@@ -69,9 +68,7 @@ def study(options) -> dict:
 
 
 def stored_figures(lines: list[dict]) -> dict[str, dict]:
-    """Figure -> {"hits", "n", "value"}, or its value alone; what no case tells is left
-    out.
-    """
+    """Figure -> {"hits", "n", "value"}, or its value alone; what no case tells is left out."""
     out = {}
     for name, found in figures.figures(lines).items():
         hits, n = found if isinstance(found, tuple) else (None, None)

@@ -1,10 +1,8 @@
-"""The family of sensors and logs: what a case's vehicle carries, and the air that it
-flies in.
+"""The family of sensors and logs: what a case's vehicle carries, and the air that it flies in.
 
-`draw` makes a case's set-up; eight kinds of sensors, two of which (`STRANGERS`) are
-drawn for reported runs only. Every case, "none" included, has biases, a tilt up to 1
-degree between IMU and tracked frame, a thrust offset up to 0.8 % and constants off by
-up to 1 % beside what is told.
+`draw` makes a case's set-up; eight kinds of sensors, two of which (`STRANGERS`) are drawn for
+reported runs only. Every case, "none" included, has biases, a tilt up to 1 degree between IMU and
+tracked frame, a thrust offset up to 0.8 % and constants off by up to 1 % beside what is told.
 """
 
 import numpy as np

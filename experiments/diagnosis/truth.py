@@ -1,10 +1,9 @@
 """What acts in a case, and whether a report is right about it.
 
-The answers of a set are one JSON file, {"cases": {name: answer}}. An answer holds
-`category` (none, single, pair, unknown, not_testable, garbage or real), `effects`, and
-optionally `acceptable` (the names that are right for each effect: a list of lists, or
-{effect: names}), `expected` (the effects that the logs show) and `also_fine` (names
-that are no mistake).
+The answers of a set are one JSON file, {"cases": {name: answer}}. An answer holds `category` (none,
+single, pair, unknown, not_testable, garbage or real), `effects`, and optionally `acceptable` (the
+names that are right for each effect: a list of lists, or {effect: names}), `expected` (the effects
+that the logs show) and `also_fine` (names that are no mistake).
 """
 
 import json
@@ -65,9 +64,7 @@ def words_of(report: dict | None) -> list[str]:
 
 
 def judge(truth: Truth, words: list[str]) -> dict:
-    """Whether the `words` of a report are right: {"right", "wrong_names",
-    "false_unknown"}.
-    """
+    """Whether the `words` of a report are right: {"right", "wrong_names", "false_unknown"}."""
     names = [w for w in words if w not in ("unknown", "garbage")]
     allowed = truth.fine.union(*truth.right)
     wrong = [n for n in names if n not in allowed]
@@ -94,9 +91,8 @@ def judge(truth: Truth, words: list[str]) -> dict:
 
 
 def right_names(truth: Truth) -> frozenset[str]:
-    """The classes of which the most probable one may be: those that are right count as
-    one, and where nothing need be named those that are no mistake count with "none", as
-    in `judge`.
+    """The classes of which the most probable one may be: those that are right count as one, and
+    where nothing need be named those that are no mistake count with "none", as in `judge`.
     """
     unnamed = {"unknown"} if truth.category == "unknown" else {"none"} | truth.fine
     return frozenset().union(*truth.right) or frozenset(unnamed)

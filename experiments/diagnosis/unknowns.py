@@ -1,13 +1,12 @@
-"""Causes outside the vocabulary, drawn by a generator: thousands of kinds, so that none
-can be written a detector for.
+"""Causes outside the vocabulary, drawn by a generator: thousands of kinds, so that none can be
+written a detector for.
 
-A kind is a site (a force, a torque, the motors, a sensor) and a function f of a random
-subset of place, motion, motors, voltage and time: a sum of random Fourier features
-(Rahimi, Recht 2007) without its mean and its linear part, as far as the inputs are
-normally distributed. What is left can't be taken over by a constant or a line in any
-input, which the vocabulary's effects are. It sets in at a random time. The `switching`
-form, for reported runs alone, is the sign of such a sum: knocks, relays, steps.
-Everything follows from the eight uniform draws of the cause.
+A kind is a site (a force, a torque, the motors, a sensor) and a function f of a random subset of
+place, motion, motors, voltage and time: a sum of random Fourier features (Rahimi, Recht 2007)
+without its mean and its linear part, as far as the inputs are normally distributed. What is left
+can't be taken over by a constant or a line in any input, which the vocabulary's effects are. It
+sets in at a random time. The `switching` form, for reported runs alone, is the sign of such a sum:
+knocks, relays, steps. Everything follows from the eight uniform draws of the cause.
 """
 
 from typing import NamedTuple
@@ -128,9 +127,7 @@ def inputs_of(position, q, velocity, rates, motors, voltage, hover):
 
 
 class Unknowns:
-    """The unknown causes of a batch of `count` bodies: {site: [(columns, cause),
-    …]}.
-    """
+    """The unknown causes of a batch of `count` bodies: {site: [(columns, cause), …]}."""
 
     def __init__(self, causes, count, hover=0.5):
         self.count = count

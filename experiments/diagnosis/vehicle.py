@@ -235,9 +235,7 @@ def multiply(a, b):
 
 
 def turn(q, w, dt):
-    """Quaternion after turning with body rates w (3, B) for dt, second order and
-    renormalised.
-    """
+    """Quaternion after turning with body rates w (3, B) for dt, second order and renormalised."""
     h = w * (0.5 * dt)
     out = q + multiply(q, np.concatenate([-0.5 * (h * h).sum(axis=0)[None], h]))
     return out / np.sqrt((out * out).sum(axis=0))

@@ -21,9 +21,7 @@ SINGLE_THREAD = {
 
 
 def use_single_thread() -> None:
-    """For this process, if NumPy and JAX aren't imported yet, and for those that it
-    starts.
-    """
+    """For this process, if NumPy and JAX aren't imported yet, and for those that it starts."""
     for name, value in SINGLE_THREAD.items():
         os.environ.setdefault(name, value)
 

@@ -1,11 +1,10 @@
-"""Policies on vehicles that they weren't made for: `python -m
-experiments.flying.vehicles [--policy NAME ...] [--number 1024]`.
+"""Policies on vehicles that they weren't made for: `python -m experiments.flying.vehicles [--policy
+NAME ...] [--number 1024]`.
 
-No clamp, rate loop at 500 Hz, solid contacts, drawn starts, the paper's evader.
-Vehicles: the nominal one; `table`, with motors 40 ms slower, commands 15 ms and poses
-10 ms late, and drag; the family of the preset `flight`. Tasks: uniform validation ones
-and the six layouts. Nothing is chosen by the layouts. Writes
-experiments/results/vehicles.json and .md (`--out`: others).
+No clamp, rate loop at 500 Hz, solid contacts, drawn starts, the paper's evader. Vehicles: the
+nominal one; `table`, with motors 40 ms slower, commands 15 ms and poses 10 ms late, and drag; the
+family of the preset `flight`. Tasks: uniform validation ones and the six layouts. Nothing is chosen
+by the layouts. Writes experiments/results/vehicles.json and .md (`--out`: others).
 """
 
 import dataclasses
@@ -57,9 +56,7 @@ def vehicles(airframe: str = NOMINAL) -> dict[str, np.ndarray]:
 
 @functools.cache
 def program(settings, policy):
-    """The compiled evaluation: (parameters, tasks, key, bounds (R, 4)) ->
-    Evaluation.
-    """
+    """The compiled evaluation: (parameters, tasks, key, bounds (R, 4)) -> Evaluation."""
     vehicle = load_vehicle(settings.airframe)
 
     def run(parameters, tasks, key, bounds):
@@ -89,9 +86,7 @@ def game_of(own: PursuitSettings, airframe: str, physics: str) -> PursuitSetting
 
 
 def fly(name: str, options) -> dict[str, dict[str, dict]]:
-    """Summaries of a policy by kind of vehicle and kind of task. `options`: of the
-    command.
-    """
+    """Summaries of a policy by kind of vehicle and kind of task. `options`: of the command."""
     policy = load_policy(name)
     game_settings = policy.settings.environment
     game = game_of(game_settings, options.airframe or game_settings.airframe, options.physics)
@@ -150,9 +145,7 @@ def page(results: dict) -> Page:
 
 
 def over_layouts(results: dict) -> Table:
-    """A row per policy: captures and crashes with each kind of vehicle, mean over the
-    layouts.
-    """
+    """A row per policy: captures and crashes with each kind of vehicle, mean over the layouts."""
     columns: dict[str, Column] = {"policy": "policy"}
     rows = []
     for name, kinds in results["policies"].items():

@@ -68,9 +68,7 @@ def page(results: dict) -> Page:
 
 
 def captures(results: dict) -> Table:
-    """The page's table: a row per method, ours / the paper's capture rate in each
-    layout.
-    """
+    """The page's table: a row per method, ours / the paper's capture rate in each layout."""
     rows = []
     for method in METHODS:
         row = {"method": method}
@@ -116,9 +114,7 @@ def beside_paper(figure: str, form: str):
 
 
 def verdicts(results: dict) -> str:
-    """Where OPEN isn't the best, and where a method is below the paper's own value of
-    it.
-    """
+    """Where OPEN isn't the best, and where a method is below the paper's own value of it."""
     above_open = []
     below_paper = []
     for layout in MAIN:

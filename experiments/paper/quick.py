@@ -36,9 +36,7 @@ TRIED_ON = ("rows .30", "rows .35", "rows .33 to .40", "gates", "cluster", "six 
 
 
 def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
-    """One run on those cores: what its table says, and the seconds of the whole
-    command.
-    """
+    """One run on those cores: what its table says, and the seconds of the whole command."""
     run = options.runs / f"seed_{seed}"
     command = [sys.executable, "-m", "openjax.train", "--preset", "quick", "--seed", str(seed)]
     command += [
@@ -64,9 +62,7 @@ def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
 
 
 def record(run: Path) -> dict:
-    """What the table of a run says, and its policy flown on the validation tasks once
-    more.
-    """
+    """What the table of a run says, and its policy flown on the validation tasks once more."""
     layouts = read_json(run / "layouts.json")
     policy = load_policy(run)
     figures = {

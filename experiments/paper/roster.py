@@ -11,9 +11,7 @@ METHODS = {
     "MAPPO": "mappo",
     "OPEN": "open",
 }
-"""The paper's six methods, and the name or the beginning of the names of their
-policies.
-"""
+"""The paper's six methods, and the name or the beginning of the names of their policies."""
 ABLATIONS = {"MAPPO + predictor": "predictor", "MAPPO + generator": "generator"}
 """The paper's other variants: MAPPO + EPN, MAPPO + AEG."""
 SEEDS = 3

@@ -11,9 +11,7 @@ unlike the training's. By layout: mean error of OPEN's predicted next position (
 
 
 def means(layout: str, method: str) -> tuple[float, int, float] | None:
-    """Capture rate, capture step and collision rate; None of what the paper doesn't
-    have.
-    """
+    """Capture rate, capture step and collision rate; None of what the paper doesn't have."""
     value = (MAIN.get(layout, {}) | PARTS.get(layout, {})).get(method)
     if value is None:
         return None

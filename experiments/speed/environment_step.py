@@ -1,15 +1,14 @@
 """Seconds that `environment.step` takes to compile, and its speed: `python -m
 experiments.speed.environment_step [--source SRC ...]`.
 
-Each SRC is a folder that holds a package `openjax`, timed in a process of its own and
-in turns, so that two versions are compared on one machine: `git archive COMMIT src
-assets | tar -x -C DIR`. The step is vmapped and runs in a scan, as in anybody's
-program. Prints a line of JSON for each.
+Each SRC is a folder that holds a package `openjax`, timed in a process of its own and in turns, so
+that two versions are compared on one machine: `git archive COMMIT src assets | tar -x -C DIR`. The
+step is vmapped and runs in a scan, as in anybody's program. Prints a line of JSON for each.
 
-With `--masked` each source is timed a second time with masks: a game of teams of any
-size, in which all slots are in use, and the evader's speed and the capture radius are
-the task's. With `--restarts` it is timed a second time as JaxMARL's users step it: an
-episode that ends starts anew, and the worlds are spread evenly over an episode.
+With `--masked` each source is timed a second time with masks: a game of teams of any size, in which
+all slots are in use, and the evader's speed and the capture radius are the task's. With
+`--restarts` it is timed a second time as JaxMARL's users step it: an episode that ends starts anew,
+and the worlds are spread evenly over an episode.
 """
 
 import argparse

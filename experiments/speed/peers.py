@@ -1,11 +1,9 @@
-"""openjax beside its peers: `python -m experiments.speed.peers [--worlds 131072]
-[--json FILE]`.
+"""openjax beside its peers: `python -m experiments.speed.peers [--worlds 131072] [--json FILE]`.
 
-Steps a second of drones (crazyflow, hyperdrone) and of a game (JaxMARL's simple_tag),
-and seconds until a tumbling drone is caught and held by a learner (Brax's PPO,
-rl-tools' SAC) on our physics. `pip install crazyflow hyperdrone jaxmarl brax rltools`
-has them; what isn't installed is left out with a line. Every call is compiled, warmed
-up and repeated; the median counts.
+Steps a second of drones (crazyflow, hyperdrone) and of a game (JaxMARL's simple_tag), and seconds
+until a tumbling drone is caught and held by a learner (Brax's PPO, rl-tools' SAC) on our physics.
+`pip install crazyflow hyperdrone jaxmarl brax rltools` has them; what isn't installed is left out
+with a line. Every call is compiled, warmed up and repeated; the median counts.
 """
 
 import argparse

@@ -1,9 +1,8 @@
-"""A task for learners of other libraries: a tumbling drone is to be caught and held at
-a point.
+"""A task for learners of other libraries: a tumbling drone is to be caught and held at a point.
 
-Each learner sees what the drone does and commands thrust and body rates a hundred times
-a second. What counts are the seconds, compilation included, until it holds the drone
-for `HOLDS` of an episode.
+Each learner sees what the drone does and commands thrust and body rates a hundred times a second.
+What counts are the seconds, compilation included, until it holds the drone for `HOLDS` of an
+episode.
 """
 
 import time
@@ -21,17 +20,13 @@ FREE = make_drones_step("rigid", contacts=False)
 EPISODE = 300
 """Steps of 10 ms."""
 HOLDS = 0.5
-"""Share of an episode within .2 m and below .5 m/s: the way there takes about a
-second.
-"""
+"""Share of an episode within .2 m and below .5 m/s: the way there takes about a second."""
 SIZE = 18
 """Numbers that a learner sees."""
 
 
 def tumble(key):
-    """A drone anywhere within .5 m of the goal, in any attitude, turning at some
-    rad/s.
-    """
+    """A drone anywhere within .5 m of the goal, in any attitude, turning at some rad/s."""
     place, turn, rates = jax.random.split(key, 3)
     quaternion = jax.random.normal(turn, (4,))
     drone = hover_state(
@@ -107,9 +102,7 @@ class RecoveryEnv(gymnasium.Env):
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
     spec = gymnasium.envs.registration.EnvSpec("Recovery-v0", max_episode_steps=EPISODE)
-    """By which rl-tools knows how long an episode is: without it its program isn't
-    compiled.
-    """
+    """By which rl-tools knows how long an episode is: without it its program isn't compiled."""
 
     def __init__(self):
         self._tumble = jax.jit(tumble)

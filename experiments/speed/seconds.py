@@ -55,9 +55,7 @@ class Runner:
             yield from self.fly(starts[0], seed, self.enough)
 
     def fly(self, start: str, seed: int, enough: Callable[[dict], bool]) -> Iterator[dict]:
-        """One run's curve, until a validation is enough; nothing where the time is
-        over.
-        """
+        """One run's curve, until a validation is enough; nothing where the time is over."""
         if time.monotonic() >= self.ends:
             return
         cache = self.cache / re.sub(r"\W+", "_", f"{start} {seed if self.cold else ''}")
@@ -204,9 +202,7 @@ def page(results: dict) -> Page:
 
 
 def medians(rows: list[dict]) -> str:
-    """A sentence for each start that three runs or more caught from, with all or
-    nothing kept.
-    """
+    """A sentence for each start that three runs or more caught from, with all or nothing kept."""
     prose = ""
     for start in dict.fromkeys(run["start"] for run in rows):
         for cached in ("all", "nothing"):

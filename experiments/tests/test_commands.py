@@ -1,6 +1,5 @@
-"""Every command line of a page or beside a result can be typed today: its program is
-there and takes its options. A result that a program of before made names the commit
-that has it.
+"""Every command line of a page or beside a result can be typed today: its program is there and
+takes its options. A result that a program of before made names the commit that has it.
 """
 
 import argparse
@@ -39,18 +38,14 @@ COMMAND = re.compile(
 
 
 def commands_in(text: str) -> list[str]:
-    """Those that begin a text, or are named among others; none with a commit beside
-    it.
-    """
+    """Those that begin a text, or are named among others; none with a commit beside it."""
     return (
         [] if COMMIT.search(text) else [a + b for a, b in COMMAND.findall(" ".join(text.split()))]
     )
 
 
 def of_record(stored, parent=None) -> list[str]:
-    """The commands of a stored result, but for those whose record has a commit or a
-    program.
-    """
+    """The commands of a stored result, but for those whose record has a commit or a program."""
     if isinstance(stored, str):
         return [] if {"program", "commit"} & set(parent or {}) else commands_in(stored)
     if isinstance(stored, dict):

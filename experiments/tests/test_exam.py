@@ -227,9 +227,7 @@ def test_written_cases_can_be_read_and_say_what_they_hold(tmp_path, monkeypatch)
 
 
 def test_rows_that_see_little_of_the_motors_hide_torque(hovering):
-    """A key whose floor forgets this asks for torques that no reader of a slow log can
-    see.
-    """
+    """A key whose floor forgets this asks for torques that no reader of a slow log can see."""
     many, p, flown = hovering
     none = np.zeros(2, bool)
     left = {}

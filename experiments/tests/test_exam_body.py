@@ -1,6 +1,4 @@
-"""The exam's vehicle against closed forms: one body's mechanics, rotors, effects and
-firmware.
-"""
+"""The exam's vehicle against closed forms: one body's mechanics, rotors, effects and firmware."""
 
 import numpy as np
 import pytest

@@ -135,8 +135,7 @@ def test_nominal_plant_agrees_with_the_rigid_simulator(nominal, from_commands):
 
 
 def test_a_case_does_not_depend_on_its_companions(nominal):
-    # otherwise the number of processes would change the flights, and a seed would mean
-    # nothing
+    # otherwise the number of processes would change the flights, and a seed would mean nothing
     alone = fly(2)
     among_others = nominal.flown["velocity"][:, :, nominal.columns[1]]
     np.testing.assert_array_equal(alone.flown["velocity"], among_others)

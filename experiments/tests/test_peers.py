@@ -1,6 +1,4 @@
-"""The study of peers leaves out what isn't installed, and its task can be recovered
-from.
-"""
+"""The study of peers leaves out what isn't installed, and its task can be recovered from."""
 
 import json
 import subprocess

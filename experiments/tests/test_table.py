@@ -1,6 +1,4 @@
-"""The page of a study: what stands beside stored results, and what a table shows of a
-record.
-"""
+"""The page of a study: what stands beside stored results, and what a table shows of a record."""
 
 import json
 import math

@@ -66,9 +66,7 @@ STUDIES = {
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_the_table_of_a_page_is_that_of_the_stored_results(name):
-    """One made by hand, elsewhere, or before the code that writes it changed would
-    differ.
-    """
+    """One made by hand, elsewhere, or before the code that writes it changed would differ."""
     page = importlib.import_module(STUDIES[name]).page
     results = read_json(RESULTS / f"{'tables' if name == 'tab_main' else name}.json")
     written = (RESULTS / f"{name}.md").read_text(encoding="utf-8")

@@ -1,9 +1,8 @@
 """From flights to a better policy: `openjax adapt FLIGHTS --policy NAME --out DIR`.
 
-Diagnoses the flights, draws vehicles from the intervals of what was found, fine-tunes
-the policy on them by the gradient through the simulation, and measures both policies on
-tasks and vehicles that neither was trained on. Writes DIR/policy.npz, adapt.json and
-adapt.html.
+Diagnoses the flights, draws vehicles from the intervals of what was found, fine-tunes the policy on
+them by the gradient through the simulation, and measures both policies on tasks and vehicles that
+neither was trained on. Writes DIR/policy.npz, adapt.json and adapt.html.
 """
 
 import dataclasses

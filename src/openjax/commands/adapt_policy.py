@@ -49,9 +49,7 @@ STEPS = {"diagnosing and compiling": 60.0, "fine-tuning": 90.0, "measuring": 10.
 ON_CPU = {"diagnosing and compiling": 80.0, "fine-tuning": 240.0, "measuring": 25.0}
 """... and without."""
 LOSSES = ("crash_rate", "collision_rate", "capture_step")
-"""Figures that a vehicle can make worse, of which adapting is to win back what it
-can.
-"""
+"""Figures that a vehicle can make worse, of which adapting is to win back what it can."""
 ERRORS = 2.0
 """A loss is one that is larger than so many standard errors of the differences of
 single episodes.
@@ -115,10 +113,9 @@ def look_of(
 ) -> Look:
     """The function by which `fine_tune` scores a policy's figures (B,), by `selection_score`.
 
-    Speeds over the limit count as far as they are more than in the same `usual` episode,
-    that of the policy as it was with the nominal vehicle: to fly as fast with the
-    diagnosed one is what is wanted, and a vehicle that made a policy slower did nothing
-    good by it.
+    Speeds over the limit count as far as they are more than in the same `usual` episode, that of
+    the policy as it was with the nominal vehicle: to fly as fast with the diagnosed one is what is
+    wanted, and a vehicle that made a policy slower did nothing good by it.
     """
     over_speed_rate = np.maximum(episodes["over_speed_rate"], usual["over_speed_rate"])
     figures = episodes | {"over_speed_rate": over_speed_rate}
@@ -145,9 +142,7 @@ class _Programs:
         )
 
     def _fly(self, parameters, tasks, number, bounds) -> dict:
-        """Figures (B,) of a policy's episodes; the same `number` draws the same
-        ones.
-        """
+        """Figures (B,) of a policy's episodes; the same `number` draws the same ones."""
         key = jax.random.fold_in(self._key, number)
         return episode_figures(self._evaluate(parameters, tasks, key, bounds).statistics)
 
@@ -255,8 +250,7 @@ def _diagnosis(command: AdaptCommand) -> Iterator[Callable[[], Path]]:
         return
     out = command.out / "diagnosis"
     name = command.flights.resolve().name
-    # a process of its own: within one, the diagnosis and the tracing of programs would
-    # take turns
+    # a process of its own: within one, the diagnosis and the tracing of programs would take turns
     shutil.rmtree(out, ignore_errors=True)
     process = subprocess.Popen(
         [sys.executable, "-m", "openjax.diagnose", str(command.flights), "--out", str(out)],

@@ -1,10 +1,9 @@
 """Speed on this machine: `openjax benchmark [--envs 1024 4096] [--json FILE]`.
 
-Steps per second of the physics (rigid and MJX, each with and without solids), of the
-environment, of rollouts with the policy and of the whole training step, over a sweep of
-environment counts; and of the programs that the step is made of, which say where its
-time goes; the step on several devices, with `--devices 1 2 4`. Same command on CPU and
-GPU.
+Steps per second of the physics (rigid and MJX, each with and without solids), of the environment,
+of rollouts with the policy and of the whole training step, over a sweep of environment counts; and
+of the programs that the step is made of, which say where its time goes; the step on several
+devices, with `--devices 1 2 4`. Same command on CPU and GPU.
 """
 
 import dataclasses
@@ -57,8 +56,7 @@ def main(arguments: Sequence[str]) -> int:
                 timing = time_compiled(case, command.seconds)
                 rows.append(_row(case, command.settings, timing))
                 console.print(_line(rows[-1]), soft_wrap=True)
-                # after each measurement, so that an interrupted sweep leaves what it
-                # has
+                # after each measurement, so that an interrupted sweep leaves what it has
                 write_json(command.json, {**facts, "settings": command.settings, "rows": rows})
     if sentence := _programs_and_step(rows):
         print(sentence)

@@ -36,9 +36,7 @@ class Workload(NamedTuple):
 
 
 def cases(command: BenchmarkCommand, part: str, num_envs: int) -> Iterator[Workload]:
-    """The cases of a part, made one at a time: together they wouldn't fit into
-    memory.
-    """
+    """The cases of a part, made one at a time: together they wouldn't fit into memory."""
     settings = command.settings
     steps = command.steps
     if part == "training":
@@ -169,17 +167,14 @@ class Timing:
     """Of all calls."""
     calls: int
     memory: int | None
-    """Bytes for arguments, results and temporaries of one call, by the compiler's
-    account.
-    """
+    """Bytes for arguments, results and temporaries of one call, by the compiler's account."""
 
 
 def time_compiled(case: Workload, min_seconds: float) -> Timing:
-    """Compile a case's function, run it once to warm up, then time three calls or more,
-    for at least `min_seconds`.
+    """Compile a case's function, run it once to warm up, then time three calls or more, for at
+    least `min_seconds`.
 
-    Each call gets the same arguments and is waited for, so that all calls do the same
-    work.
+    Each call gets the same arguments and is waited for, so that all calls do the same work.
     """
     start = time.perf_counter()
     executable = jax.jit(case.function).lower(*case.arguments).compile()

@@ -1,6 +1,5 @@
-"""`openjax calibrate CASE_DIR`: fit the nominal vehicle's own constants to flights,
-with intervals and with what the flights can't tell, and write a `vehicle.toml` that
-trainer and diagnosis load.
+"""`openjax calibrate CASE_DIR`: fit the nominal vehicle's own constants to flights, with intervals
+and with what the flights can't tell, and write a `vehicle.toml` that trainer and diagnosis load.
 """
 
 import dataclasses
@@ -82,8 +81,7 @@ def _print(result, console: Console) -> None:
             label = name.replace("_", " ")
             if len(quantity.value) > 1:
                 label += f" {('xx', 'yy', 'zz')[i]}"
-            # in yaw only the torque constant over the inertia shows: this is taken as
-            # nominal
+            # in yaw only the torque constant over the inertia shows: this is taken as nominal
             is_assumption = name == "inertia" and i == 2
             low, high = quantity.interval90[i]
             remark = "" if quantity.determined else "not determined: nominal kept"

@@ -1,6 +1,4 @@
-"""The commands as functions: what `openjax.train(...)` and `openjax.evaluate(...)` do
-in Python.
-"""
+"""The commands as functions: what `openjax.train(...)` and `openjax.evaluate(...)` do in Python."""
 
 import dataclasses
 import inspect
@@ -27,9 +25,7 @@ from openjax.store.run_directory import open_run
 
 
 def _with_fields(*kinds: type) -> Callable:
-    """Have a function's signature show the fields of dataclasses, which it takes as
-    keywords.
-    """
+    """Have a function's signature show the fields of dataclasses, which it takes as keywords."""
 
     def show(function):
         signature = inspect.signature(function)

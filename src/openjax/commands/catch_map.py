@@ -55,8 +55,7 @@ def cells_of(command: MapCommand) -> list[Cell]:
 
 
 def map_game(command: MapCommand, game: PursuitSettings) -> PursuitSettings:
-    """The game of all cells: a policy's, with slots for the largest team, and nominal
-    vehicles.
+    """The game of all cells: a policy's, with slots for the largest team, and nominal vehicles.
 
     Raises:
       UserError: nothing is asked for, or another number of pursuers than the policy
@@ -235,8 +234,7 @@ class _Flyer:
 
         parts = []
         for start in range(0, number, batch):
-            # the program knows one size: the last batch is filled up with the last
-            # episode
+            # the program knows one size: the last batch is filled up with the last episode
             place = np.minimum(np.arange(start, start + batch), number - 1)
             which, episode = np.divmod(place, episodes)
             values = jnp.asarray(cells, jnp.float32)[which]

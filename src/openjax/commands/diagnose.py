@@ -1,6 +1,4 @@
-"""Diagnose the sim-to-real gap of flights: `openjax diagnose CASE_DIR [CASE_DIR
-...]`.
-"""
+"""Diagnose the sim-to-real gap of flights: `openjax diagnose CASE_DIR [CASE_DIR ...]`."""
 
 import contextlib
 import sys

@@ -39,11 +39,10 @@ class FlightOptions:
     """The flights of a command: policies on layouts, against an evader."""
 
     policy: tuple[str, ...] | None = None
-    """Runs' directories, policy files (.npz), checkpoints, or names of policies in the
-    package (flight, open ...) or of heuristics (angelani, janosov, apf, stack), or
-    FILE.py:function for a controller of one's own. By default evaders, or teams for
-    another number of pursuers than three, another speed of the evader, capture radius
-    or arena.
+    """Runs' directories, policy files (.npz), checkpoints, or names of policies in the package
+    (flight, open ...) or of heuristics (angelani, janosov, apf, stack), or FILE.py:function for a
+    controller of one's own. By default evaders, or teams for another number of pursuers than three,
+    another speed of the evader, capture radius or arena.
     """
     scenario: str = "all"
     """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout,
@@ -51,25 +50,22 @@ class FlightOptions:
     these have three pursuers: a policy of another number flies uniform instead.
     """
     num_pursuers: Annotated[int | None, Interval("[1, 8]")] = None
-    """Pursuers; by default as many as in training. A policy for teams of any size flies
-    three by default, all episodes with one evader's speed, one capture radius and one
-    arena.
+    """Pursuers; by default as many as in training. A policy for teams of any size flies three by
+    default, all episodes with one evader's speed, one capture radius and one arena.
     """
     seed: Seed = 0
     """Draws the start attitudes."""
     opponent: str | None = None
-    """Evader to fly against: field, greedy, wall_runner, slow_hugger, heavy,
-    pillar_hugger, greedy_far, greedy_near, two_step, safe_place, way_points, frozen, a
-    file that openjax exploit wrote, or a function of one's own, FILE.py:function; by
-    default those of the policy's game.
+    """Evader to fly against: field, greedy, wall_runner, slow_hugger, heavy, pillar_hugger,
+    greedy_far, greedy_near, two_step, safe_place, way_points, frozen, a file that openjax exploit
+    wrote, or a function of one's own, FILE.py:function; by default those of the policy's game.
     """
     compilation_cache: bool = True
     """Keep compiled programs in the user's cache folder."""
 
     def start(self, environment: PursuitSettings | None = None) -> list["LoadedPolicy"]:
-        """The policies, loaded, after JAX was told where it keeps programs. Raises
-        UserError where there are none. `environment`: settings that were typed; None:
-        none were.
+        """The policies, loaded, after JAX was told where it keeps programs. Raises UserError where
+        there are none. `environment`: settings that were typed; None: none were.
         """
         if self.compilation_cache:
             cache_programs()
@@ -106,10 +102,9 @@ class FlightOptions:
 class EvaluateCommand(FlightOptions):
     """Fly a policy's mean on a layout and count captures, collisions and crashes.
 
-    The game is the one that the policy was trained in; any --environment.setting can be
-    changed, for example --environment.speed_limit none or --environment.start_attitude
-    level. Of several policies, for example one per training seed, mean and standard
-    deviation are shown too.
+    The game is the one that the policy was trained in; any --environment.setting can be changed,
+    for example --environment.speed_limit none or --environment.start_attitude level. Of several
+    policies, for example one per training seed, mean and standard deviation are shown too.
     """
 
     episodes: Annotated[int, Interval("[1, 1000000]")] = 100
@@ -261,9 +256,7 @@ def find_game(command: EvaluateCommand, policy: "LoadedPolicy") -> tuple:
 
 
 def _environment(command, game, policy):
-    """The game with all that the command, or a policy of a game of one's own, adds to
-    it.
-    """
+    """The game with all that the command, or a policy of a game of one's own, adds to it."""
     from openjax.store.environments import make_environment
 
     trained_in = policy.environment
@@ -278,9 +271,7 @@ def _environment(command, game, policy):
 
 
 def _show(command, results):
-    """Print the tables and write the file: a record, a list of them, or such a list by
-    policy.
-    """
+    """Print the tables and write the file: a record, a list of them, or such a list by policy."""
     from openjax.evaluation.result_tables import results_table, spread_table
     from openjax.runs.words import unlike_the_papers
 

@@ -46,9 +46,7 @@ class ExportCommand:
     """Write a policy as ONNX, as a serialised JAX function, or as C."""
 
     policy: str = DEFAULT_POLICY
-    """A run's directory, a policy file (.npz), or the name of a policy in the
-    package.
-    """
+    """A run's directory, a policy file (.npz), or the name of a policy in the package."""
     format: Literal["onnx", "jax", "c"] = "onnx"
     """onnx: for onnxruntime and its kin (pip install onnx onnxruntime); jax: for
     jax.export.deserialize; c: C99.
@@ -212,9 +210,7 @@ def _describe(inputs) -> dict:
 
 
 def _onnx(act, inputs, samples, about):
-    """The files, their actions on the sampled observations, and what to say about
-    them.
-    """
+    """The files, their actions on the sampled observations, and what to say about them."""
     import numpy as np
 
     from openjax.export.onnx_graph import onnx_model, size

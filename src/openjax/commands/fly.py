@@ -1,8 +1,7 @@
-"""`openjax fly --policy PATH --uri URI [URI ...]`: fly a policy on Crazyflies, real or
-virtual.
+"""`openjax fly --policy PATH --uri URI [URI ...]`: fly a policy on Crazyflies, real or virtual.
 
-A hundred times a second from poses to body rates and thrust, through the real `cflib`.
-The flight is written as a case that `openjax diagnose` reads.
+A hundred times a second from poses to body rates and thrust, through the real `cflib`. The flight
+is written as a case that `openjax diagnose` reads.
 """
 
 from __future__ import annotations
@@ -26,18 +25,15 @@ from openjax.store import default_policy
 
 PROGRAM = "openjax fly"
 DRIFT = 0.1
-"""m/s, of an own estimate, that nothing on board tells
-(experiments/results/flying.md).
-"""
+"""m/s, of an own estimate, that nothing on board tells (experiments/results/flying.md)."""
 
 
 @dataclass(frozen=True)
 class FlyCommand:
-    """Fly a policy on as many Crazyflies as it has pursuers, and log it for the
-    diagnosis.
+    """Fly a policy on as many Crazyflies as it has pursuers, and log it for the diagnosis.
 
-    While it flies: space or q stops all motors; l, Ctrl-C, Ctrl-Z or a closed terminal
-    land; h waits.
+    While it flies: space or q stops all motors; l, Ctrl-C, Ctrl-Z or a closed terminal land; h
+    waits.
     """
 
     policy: str | None = None
@@ -49,17 +45,13 @@ class FlyCommand:
     shows what it does), or a CSV of openjax plan.
     """
     uri: tuple[str, ...] = tuple(f"udp://127.0.0.1:{UDP_PORT + i}" for i in range(3))
-    """One vehicle per pursuer: udp://HOST:PORT (virtual), radio://0/80/2M/E7E7E7E7E7
-    (real).
-    """
+    """One vehicle per pursuer: udp://HOST:PORT (virtual), radio://0/80/2M/E7E7E7E7E7 (real)."""
     evader_uri: str | None = None
     """A further vehicle that flies the evader by the game's rule; without it the evader
     is a point in the computer.
     """
     scenario: str = "wall"
-    """Layout: a name or a TOML file. Pillars exist in the computer only, unless you put
-    them up.
-    """
+    """Layout: a name or a TOML file. Pillars exist in the computer only, unless you put them up."""
     episodes: Annotated[int, Interval("[1, 100000]")] = 1
     """Games, one after the other. Between them all fly straight back: with real pillars
     leave it at 1.
@@ -81,13 +73,9 @@ class FlyCommand:
     openjax.flying.motion_capture.
     """
     guard: bool = True
-    """A further process lands the vehicles if the others stop. Don't fly real ones
-    without.
-    """
+    """A further process lands the vehicles if the others stop. Don't fly real ones without."""
     guard_after: Annotated[float, Interval("[0.01, 60]")] = 0.1
-    """Silence of the loop, or of the links, after which the next process lands all
-    (s).
-    """
+    """Silence of the loop, or of the links, after which the next process lands all (s)."""
     watchdog: bool = True
     """Let the firmware stop the motors 1 s after the last set-point (otherwise 2 s). It
     locks the vehicle, also after the flight; the next one restarts it.
@@ -101,8 +89,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def fly(arguments: FlyCommand, preparation: Prepared | None = None) -> None:
-    """Fly. Raises UserError for what can't be, and where another process had to land
-    the vehicles.
+    """Fly. Raises UserError for what can't be, and where another process had to land the vehicles.
 
     Args:
       arguments: the command's.
@@ -221,8 +208,7 @@ def _game(arguments: FlyCommand) -> Course:
     policy = policy.of_team(len(scenario.pursuers))
     settings = policy.settings.environment
     _check_numbers(arguments, len(scenario.pursuers), settings.num_pursuers)
-    # a layout may have more pillars than the policy was trained with; it observes the
-    # nearest ones
+    # a layout may have more pillars than the policy was trained with; it observes the nearest ones
     slots = max(settings.max_pillars, len(scenario.pillars))
     task = scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario)
     length = settings.episode_length * settings.time_step

@@ -70,9 +70,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _show(command, results, console):
-    """Draw the picture, of evaders that learned where there are some, and tell the
-    least cell.
-    """
+    """Draw the picture, of evaders that learned where there are some, and tell the least cell."""
     from openjax.commands.catch_map import cells_against
     from openjax.show.plots import plot_map
 

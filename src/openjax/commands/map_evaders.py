@@ -54,9 +54,7 @@ class MapEvaders:
 
     @property
     def duel(self) -> Duel:
-        """The game with an evader that is told where to fly; its own rule is the
-        cheapest one.
-        """
+        """The game with an evader that is told where to fly; its own rule is the cheapest one."""
         return Duel(Pursuit(dataclasses.replace(self.game, evaders=("field",))), self.loaded.policy)
 
     @property
@@ -129,9 +127,7 @@ class MapEvaders:
         return EvaderFlights("an evader that plans", fly, episodes, self.loaded.parameters, width)
 
     def evaders(self, tell: Callable[[str], None]) -> tuple[Evaders, list[dict]]:
-        """Those of the command's file, or new ones, and what was told while they
-        learned.
-        """
+        """Those of the command's file, or new ones, and what was told while they learned."""
         command = self.command
         learners, curve = (
             self.learn(tell) if command.learned is None else self.load(command.learned)

@@ -17,9 +17,7 @@ WHO = {
     "learned": "one that learned to escape from this team",
     "scripted": "one that flies by rules",
 }
-"""Kinds of evaders (`openjax.commands.catch_map.cells_against`), and how the page calls
-them.
-"""
+"""Kinds of evaders (`openjax.commands.catch_map.cells_against`), and how the page calls them."""
 
 
 def map_page(maps: Mapping[str, dict]) -> str:

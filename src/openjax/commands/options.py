@@ -1,6 +1,4 @@
-"""Options of the commands that compile for long, without JAX, so that their help comes at
-once.
-"""
+"""Options of the commands that compile for long, without JAX, so that their help comes at once."""
 
 import dataclasses
 from pathlib import Path
@@ -24,10 +22,9 @@ class ExploitCommand:
     """
 
     policy: str | None = None
-    """A run's directory, a policy file (.npz), a checkpoint, the name of a policy in
-    the package or of a heuristic, or FILE.py:function for a controller of one's own. By
-    default evaders, or teams for another number of pursuers than three, another speed
-    of the evader, capture radius or arena.
+    """A run's directory, a policy file (.npz), a checkpoint, the name of a policy in the package or
+    of a heuristic, or FILE.py:function for a controller of one's own. By default evaders, or teams
+    for another number of pursuers than three, another speed of the evader, capture radius or arena.
     """
     out: Path = Path("evader.npz")
     """File to write the strongest learned evader to."""
@@ -71,9 +68,7 @@ class MapCommand:
     out: Path = Path("map.png")
     """File for the picture: a small map for each size of team."""
     page: Path | None = None
-    """File for a page to move about in (.html), for a reader who knows no game
-    theory.
-    """
+    """File for a page to move about in (.html), for a reader who knows no game theory."""
     json: Path | None = None
     """File to write all cells to."""
     sizes: Annotated[tuple[int, ...], Interval("[1, 8]")] = (1, 2, 3, 4, 5, 6, 7, 8)
@@ -91,30 +86,22 @@ class MapCommand:
     arena_radius: Annotated[float, Interval("[0.1, 100]")] = PursuitSettings.arena_radius
     """Radius of the arena (m)."""
     evaders: tuple[str, ...] = HELD_OUT
-    """One of them is drawn for each episode; by default those that no preset trains
-    with.
-    """
+    """One of them is drawn for each episode; by default those that no preset trains with."""
     episodes: Annotated[int, Interval("[1, 1000000]")] = 200
     """Episodes of each cell."""
     messages: MessageSettings = dataclasses.field(default_factory=MessageSettings)
     fall_outs: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the episodes of two or more pursuers in which one of them is gone after
-    2 s.
-    """
+    """Share of the episodes of two or more pursuers in which one of them is gone after 2 s."""
     sight_range: Annotated[float, Interval("(0, 1000]")] = PursuitSettings.sight_range
     """Distance up to which a pursuer sees the evader (m)."""
     sight_angle: Annotated[float, Interval("(0, 360]")] = PursuitSettings.sight_angle
-    """Opening angle of the cone about its body x axis within which a pursuer sees it
-    (degrees).
-    """
+    """Opening angle of the cone about its body x axis within which a pursuer sees it (degrees)."""
     best_response: tyro.conf.FlagConversionOff[bool] = True
     """Let evaders learn against the policy, one network for all cells, and fly them in
     all cells, too; by default not on a CPU.
     """
     learned: Path | None = None
-    """File of evaders that learned in a map before (--evaders_out), in place of
-    learning.
-    """
+    """File of evaders that learned in a map before (--evaders_out), in place of learning."""
     evaders_out: Path | None = None
     """File to write those that learned to (.npz)."""
     minutes: Annotated[float | None, Interval("(0, 100000]")] = None
@@ -128,9 +115,7 @@ class MapCommand:
     planner_share: Annotated[float, Interval("[0, 1]")] = 0.1
     """Share of the cells in which an evader that plans flies, too."""
     planner_episodes: Annotated[int, Interval("[1, 1000000]")] = 50
-    """Its episodes in each of them, the first of the cell's: each takes hundreds of
-    others.
-    """
+    """Its episodes in each of them, the first of the cell's: each takes hundreds of others."""
     planning: PlannerSettings = dataclasses.field(default_factory=PlannerSettings)
     batch: Annotated[int, Interval("[1, 1000000]")] = 8192
     """Episodes that are flown at once."""
@@ -145,9 +130,7 @@ class AdaptCommand:
     """Diagnose flights and fine-tune a policy to the vehicle that flew them."""
 
     flights: Annotated[Path, tyro.conf.Positional] = Path("flights")
-    """Folder of flight logs with a vehicle.toml, or an effects.toml of a diagnosis made
-    before.
-    """
+    """Folder of flight logs with a vehicle.toml, or an effects.toml of a diagnosis made before."""
     policy: str = DEFAULT_POLICY
     """A run, a policy file or the name of a policy in the package."""
     out: Path = Path("adapted")
@@ -171,9 +154,7 @@ PARTS = get_args(Part)
 
 @dataclasses.dataclass(frozen=True)
 class BenchmarkCommand:
-    """Measure steps per second of each layer, from the physics to the whole training
-    step.
-    """
+    """Measure steps per second of each layer, from the physics to the whole training step."""
 
     preset: str | None = None
     """quick, paper, flight, mappo or dacoop: networks and learner; by default what fits
@@ -182,9 +163,7 @@ class BenchmarkCommand:
     envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
     """Environment counts; by default a sweep that fits the machine."""
     training_envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
-    """Environment counts of the training step; by default those that fit the
-    machine.
-    """
+    """Environment counts of the training step; by default those that fit the machine."""
     devices: Annotated[tuple[int, ...], Interval("[1, 65536]")] = (1,)
     """Numbers of devices on which the training step is measured; its worlds are shared
     out to them.

@@ -15,17 +15,13 @@ PROGRAM = "openjax plan"
 
 @dataclass(frozen=True)
 class PlanCommand:
-    """Rank segments of flight by what they are expected to tell about a diagnosis'
-    causes.
+    """Rank segments of flight by what they are expected to tell about a diagnosis' causes.
 
-    Writes OUT/plan.csv, set-points for openjax fly --plan and for Crazyswarm2, and
-    OUT/plan.json.
+    Writes OUT/plan.csv, set-points for openjax fly --plan and for Crazyswarm2, and OUT/plan.json.
     """
 
     diagnosis: Annotated[str, tyro.conf.Positional]
-    """Folder of a report of openjax diagnose; or identify: the standard plan of two
-    minutes.
-    """
+    """Folder of a report of openjax diagnose; or identify: the standard plan of two minutes."""
     out: Path = Path("plan")
     """Folder to write to; must not exist or be empty."""
     vehicle: str | None = None

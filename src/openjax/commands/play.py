@@ -56,9 +56,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def make_table(command: PlayCommand):
-    """The games of a command, compiled. Raises UserError for an unusable policy or
-    layout.
-    """
+    """The games of a command, compiled. Raises UserError for an unusable policy or layout."""
     import jax
 
     from openjax.commands.play_game import Simulation

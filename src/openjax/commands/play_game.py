@@ -75,9 +75,7 @@ class Simulation:
         return PersonsGame(self, observation, state, task)
 
     def step(self, observation: Any, state: Any, wish: np.ndarray) -> tuple:
-        """Observation and state a step later, whether the game is over, and its
-        `Moment`.
-        """
+        """Observation and state a step later, whether the game is over, and its `Moment`."""
         observation, state, over, moment = self._advance(
             self._parameters, observation, state, jnp.asarray(wish, jnp.float32)
         )
@@ -136,9 +134,7 @@ class PersonsGame:
         self.over = is_last or self.is_capture
 
     def trajectory(self, title: str, steps: int | None = None) -> Trajectory:
-        """The start and what was flown since, or so many steps of it, for the replay's
-        page.
-        """
+        """The start and what was flown since, or so many steps of it, for the replay's page."""
         settings = self._simulation.settings
         moments = [self.start, *self.moments[:steps]]
         task = jax.device_get(self._task)

@@ -18,9 +18,7 @@ from openjax.show.replay import plain_episode, replay_page
 TITLE = "you are the evader"
 LIVE = Path(__file__).with_name("play.js")
 SILENCE = 15.0
-"""Seconds after which a page that listens is sent a comment, by which a closed one shows
-itself.
-"""
+"""Seconds after which a page that listens is sent a comment, by which a closed one shows itself."""
 LONGEST_WISH = 200
 """Bytes of a message from the page."""
 

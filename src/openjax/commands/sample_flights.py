@@ -27,9 +27,7 @@ _EFFECT_HELP = (
 
 @dataclass(frozen=True)
 class SampleFlightsCommand:
-    """Fly openjax's own vehicle through three manoeuvres and write the logs as a
-    case.
-    """
+    """Fly openjax's own vehicle through three manoeuvres and write the logs as a case."""
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder to write the case to; must not exist or be empty."""

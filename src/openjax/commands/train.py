@@ -1,9 +1,8 @@
 """Train pursuers: `openjax train [--preset NAME] [--out DIR] [--any.setting value]`.
 
-Writes a run directory (see `openjax.store.run_directory`) with logs, checkpoints, the
-best policy and pictures. Ctrl-C or SIGTERM saves and exits; `--resume DIR` goes on
-exactly where it stopped. From Python: `openjax.train(settings, out)`, see
-`openjax.commands.calls.train`.
+Writes a run directory (see `openjax.store.run_directory`) with logs, checkpoints, the best policy
+and pictures. Ctrl-C or SIGTERM saves and exits; `--resume DIR` goes on exactly where it stopped.
+From Python: `openjax.train(settings, out)`, see `openjax.commands.calls.train`.
 """
 
 import time
@@ -37,9 +36,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _help(arguments):
-    """The options and a preset's defaults, without waiting for JAX to find its
-    devices.
-    """
+    """The options and a preset's defaults, without waiting for JAX to find its devices."""
     from openjax.learning.presets import preset
     from openjax.runs.train_command import PROGRAM, TrainCommand
 

@@ -34,9 +34,7 @@ class ViewCommand(FlightOptions):
     html: Path | None = None
     """Write the page to this file, to send to somebody, instead of serving it."""
     gif: Path | None = None
-    """Write an animation to this file instead, of the first layout with the first
-    policy.
-    """
+    """Write an animation to this file instead, of the first layout with the first policy."""
     mcap: Path | None = None
     """Write an MCAP file for Foxglove instead (pip install mcap)."""
     flights: Path | None = None

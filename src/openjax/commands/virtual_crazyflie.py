@@ -36,14 +36,11 @@ class VirtualCrazyflieCommand:
     port: Annotated[int, Interval("[0, 65535]")] = UDP_PORT
     """UDP port of the first; cflib's scan looks at 19850 to 19859."""
     scenario: str = "wall"
-    """They stand below the pursuers' starts of this layout (a name or a TOML file);
-    more of them in a row behind. middle: the first in the middle, where the plans of
-    openjax fly --plan begin.
+    """They stand below the pursuers' starts of this layout (a name or a TOML file); more of them in
+    a row behind. middle: the first in the middle, where the plans of openjax fly --plan begin.
     """
     vehicle: Path | None = None
-    """The vehicle inside: crazyflie, brushless, or a vehicle.toml; by default the
-    Crazyflie 2.1.
-    """
+    """The vehicle inside: crazyflie, brushless, or a vehicle.toml; by default the Crazyflie 2.1."""
     effects: Path | None = None
     """Physical effects that it suffers from (effects.toml)."""
     battery: Annotated[float, Interval("(0, 1]")] = 1.0
@@ -51,9 +48,7 @@ class VirtualCrazyflieCommand:
     endurance: Annotated[float, Interval("(0, 100000]")] = 420.0
     """Seconds of hover that a full battery lasts."""
     needs_arming: bool = True
-    """Motors stay off until armed; False: armed from the start, as brushed Crazyflies
-    are.
-    """
+    """Motors stay off until armed; False: armed from the start, as brushed Crazyflies are."""
     seconds: Annotated[float | None, Interval("(0, 1e9]")] = None
     """End after this time; by default only when interrupted."""
     link: Annotated[LinkFaults, tyro.conf.arg(name="")] = field(default_factory=LinkFaults)

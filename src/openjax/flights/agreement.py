@@ -1,10 +1,9 @@
-"""Do a flight's channels agree with each other? What one says, another must show:
-attitude and gyroscope, position and velocity, the path's acceleration and the
-attitude's thrust, the accelerometer and the path, motors, commands and what follows
-them. A log whose channels contradict each other isn't diagnosed, whatever made it:
-swapped axes, a wrong convention, unit or motor order, rows out of order, columns of
-another flight, noise in place of data. Where another labelling or convention mends a
-pair, that is what is said.
+"""Do a flight's channels agree with each other? What one says, another must show: attitude and
+gyroscope, position and velocity, the path's acceleration and the attitude's thrust, the
+accelerometer and the path, motors, commands and what follows them. A log whose channels contradict
+each other isn't diagnosed, whatever made it: swapped axes, a wrong convention, unit or motor order,
+rows out of order, columns of another flight, noise in place of data. Where another labelling or
+convention mends a pair, that is what is said.
 """
 
 import dataclasses
@@ -118,9 +117,7 @@ def _other_quaternion(signals: Signals, pairs: list[SignalPair]) -> list[Finding
 
 
 def _unit(pair: SignalPair) -> list[Finding]:
-    """Columns of a pair that agrees but for its size, where a wrong unit explains
-    that.
-    """
+    """Columns of a pair that agrees but for its size, where a wrong unit explains that."""
     agreement = pair.agreement
     follows = (agreement.correlation > AGREE) & (agreement.reference > 1e-9)
     if not follows.any():
@@ -135,8 +132,7 @@ def _unit(pair: SignalPair) -> list[Finding]:
                     f"format wants {logged_unit}"
                 )
                 return [("units", text, [pair.what])]
-    # noise and an estimator's lag cost correlation, and change a gain of rms values by
-    # as much
+    # noise and an estimator's lag cost correlation, and change a gain of rms values by as much
     clear = pair.tells & (agreement.correlation > CLEAR)
     if pair.holds != "body_rates" or clear.sum() < 2:
         return []
@@ -165,9 +161,7 @@ def _inversions(signals: Signals) -> list[Finding]:
 
 
 def _upside_down(signals: Signals) -> list[Finding]:
-    """Axes of world and body by which gravity points the right way, and nothing
-    disagrees.
-    """
+    """Axes of world and body by which gravity points the right way, and nothing disagrees."""
     if signals.force is None or np.median(signals.force[:, 2]) > 0.0:
         return []
     words = frames_of(signals)

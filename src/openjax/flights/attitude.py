@@ -1,10 +1,9 @@
 """The attitude where none was logged, from gyroscope, accelerometer and path.
 
-What the accelerometer feels, turned into the world, is the path's acceleration and
-gravity. The gyroscope says how the body turned meanwhile, so one rotation of each
-flight is free (Wahba's problem, solved by Kabsch 1976), and a slow error of the
-gyroscope: a linear spline, fitted by Gauss-Newton steps. No dynamics are assumed: what
-acts on the vehicle is left as it is.
+What the accelerometer feels, turned into the world, is the path's acceleration and gravity. The
+gyroscope says how the body turned meanwhile, so one rotation of each flight is free (Wahba's
+problem, solved by Kabsch 1976), and a slow error of the gyroscope: a linear spline, fitted by
+Gauss-Newton steps. No dynamics are assumed: what acts on the vehicle is left as it is.
 """
 
 import dataclasses
@@ -54,8 +53,7 @@ def _attitude(part: Flight) -> np.ndarray:
     size = round(WINDOW / STEP)
     windows = len(time) // size - 1
     ends = size * np.arange(windows + 1)
-    # an accelerometer feels what holds the vehicle against gravity, as if it
-    # accelerated upwards
+    # an accelerometer feels what holds the vehicle against gravity, as if it accelerated upwards
     velocity_force = np.diff(velocity[ends], axis=0) / WINDOW + [0.0, 0.0, GRAVITY]
     rotation = _integrate(rates)
     beginning = slice(0, max(int(START / WINDOW), FEWEST))

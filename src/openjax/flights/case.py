@@ -56,8 +56,7 @@ class LogFolder:
             )
             more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
             raise TooLittle(f"{self.path}: no flight can be used: {first}{more}")
-        # A thrust error is told from the mass only where every vehicle that flew was
-        # weighed.
+        # A thrust error is told from the mass only where every vehicle that flew was weighed.
         is_weighed = all(vehicle_file.mass_weighed_of(flight.vehicle) for flight in flights)
         vehicle_file = replace(vehicle_file, mass_weighed=is_weighed)
         name = self.path.resolve().name
@@ -208,9 +207,7 @@ def _without_distrust(
 def _check(
     flight: Flight, vehicle_file: VehicleFile, comparison: bool
 ) -> tuple[Flight | None, list[Issue]]:
-    """One flight checked and mended, None where it can't be used, and what was
-    found.
-    """
+    """One flight checked and mended, None where it can't be used, and what was found."""
     vehicle = vehicle_file.vehicle_of(flight.vehicle)
     try:
         usable, issues = check_flight(flight, vehicle, vehicle_file.log, comparison)

@@ -15,11 +15,10 @@ from openjax.flights.time_checks import in_time, while_motors_turn
 def check_flight(
     flight: Flight, vehicle, log: dict | None = None, comparison: bool = False
 ) -> tuple[Flight | None, list[Issue]]:
-    """Check one flight as read. Returns it sorted, cleaned and cut to its airborne
-    part, or None if it can't be used, and the findings. `vehicle` is the nominal
-    vehicle, `log` the vehicle file's `[log]` table (floor_z). For a `comparison` of
-    flights with flights the motor commands alone are enough, and every airborne stretch
-    is kept, not only the longest.
+    """Check one flight as read. Returns it sorted, cleaned and cut to its airborne part, or None if
+    it can't be used, and the findings. `vehicle` is the nominal vehicle, `log` the vehicle file's
+    `[log]` table (floor_z). For a `comparison` of flights with flights the motor commands alone are
+    enough, and every airborne stretch is kept, not only the longest.
     """
     issues: list[Issue] = []
 

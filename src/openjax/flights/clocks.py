@@ -1,13 +1,12 @@
 """The moment at which motors act, from their commands and the turning of the body, without a fit of
 any cause.
 
-Torques turn the body at once: the angular acceleration that motors would make, through
-their lag, is where the cross-correlation with what the gyroscope reads is largest
-(Knapp, Carter 1976). Roll and pitch tell it: in yaw rotors that speed up turn the body
-before their drag does, which looks like a row's shift. It may come later than the
-motors' lag says, as slow motors and late links do, and earlier, as quick motors do. It is
-another clock only where no lag explains it: then a row of commands holds what acted before
-it, or the two streams are on different clocks.
+Torques turn the body at once: the angular acceleration that motors would make, through their lag,
+is where the cross-correlation with what the gyroscope reads is largest (Knapp, Carter 1976). Roll
+and pitch tell it: in yaw rotors that speed up turn the body before their drag does, which looks
+like a row's shift. It may come later than the motors' lag says, as slow motors and late links do,
+and earlier, as quick motors do. It is another clock only where no lag explains it: then a row of
+commands holds what acted before it, or the two streams are on different clocks.
 """
 
 import dataclasses
@@ -167,9 +166,7 @@ def on_gyroscope_clock(track: Track, clock: MotorClock) -> Track:
 
 
 def case_on_gyroscope_clock(case: Case, delays: Mapping[str, float]) -> Case:
-    """A case whose flights hold their motor commands when they act, see
-    `MotorClock.late`.
-    """
+    """A case whose flights hold their motor commands when they act, see `MotorClock.late`."""
     flights = []
     for flight in case.flights:
         delay = delays.get(flight.name, 0.0)
@@ -213,8 +210,7 @@ def _offsets(signals) -> dict[str, float]:
             likeness.setdefault(_flight_of(track), []).append((correlation, track.dt / FINER))
     curves = {}
     for flight, parts in likeness.items():
-        # Stretches of one flight may have rows of another length: all on the grid of
-        # the shortest.
+        # Stretches of one flight may have rows of another length: all on the grid of the shortest.
         reach = min(len(part) // 2 * step for part, step in parts)
         step = parts[0][1]
         grid = step * np.arange(-int(reach / step), int(reach / step) + 1)

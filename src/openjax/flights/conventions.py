@@ -13,8 +13,7 @@ from openjax.flights.pairs import Signals
 from openjax.flights.track import rotation
 
 RECIPE = "the recipe is on the page of the log format, under Rows in NED"
-# Both turn back what they turn: half a turn about x, and about the line between north
-# and east.
+# Both turn back what they turn: half a turn about x, and about the line between north and east.
 DOWN = Rotation.from_quat([1.0, 0.0, 0.0, 0.0])
 NORTH = Rotation.from_quat([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 
@@ -26,9 +25,7 @@ class Convention:
     words: str
     """The mistake, and what would be right."""
     convert: Callable[[Signals], Signals]
-    """The signals as they are in the log format's convention, if they were logged in
-    this one.
-    """
+    """The signals as they are in the log format's convention, if they were logged in this one."""
 
 
 def upright(signals: Signals) -> bool:
@@ -53,9 +50,7 @@ def other_pitch(signals: Signals) -> Signals:
 
 
 def rotate(signals: Signals, world: Rotation | None, body: Rotation | None) -> Signals:
-    """With the world's and the body's axes turned, those of every channel that is in
-    them.
-    """
+    """With the world's and the body's axes turned, those of every channel that is in them."""
     changes = {}
     for names, turn in (
         (("position", "velocity"), world),

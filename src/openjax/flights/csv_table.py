@@ -1,6 +1,4 @@
-"""A log as a CSV file, plain or gzipped: read into a table of columns, and written from
-one.
-"""
+"""A log as a CSV file, plain or gzipped: read into a table of columns, and written from one."""
 
 import gzip
 import math
@@ -79,9 +77,7 @@ def read_csv(
 def _numbers(
     rows: list[tuple[int, str]], header: Header, places: list[int], number: Callable[[str], float]
 ) -> np.ndarray:
-    """(R, columns) of the columns `places`. Raises LogError where a cell is no
-    number.
-    """
+    """(R, columns) of the columns `places`. Raises LogError where a cell is no number."""
     lines = [line for _, line in rows]
     try:
         return np.loadtxt(
@@ -120,9 +116,8 @@ def _vehicles(rows: list[tuple[int, str]], delimiter: str, column: int) -> np.nd
 
 
 def write_csv(path: str | Path, table: LogTable, decimals: dict[str, int] | None = None) -> None:
-    """Write a table as a log (gzipped where the name ends in `.gz`, with no time stamp
-    in it: same data, same bytes). `decimals` per column; 6 where it isn't named. A NaN
-    becomes an empty cell.
+    """Write a table as a log (gzipped where the name ends in `.gz`, with no time stamp in it: same
+    data, same bytes). `decimals` per column; 6 where it isn't named. A NaN becomes an empty cell.
     """
     names = [n for n in LOG_COLUMNS if n in table.columns or n == "vehicle"]
     data = f"{','.join(names)}\n{csv_rows(table, names, decimals or {})}".encode()
@@ -211,9 +206,7 @@ def _whole_lines(lines: list[str], header: Header) -> tuple[list[tuple[int, str]
 def _without_units(
     rows: list[tuple[int, str]], header: Header, places: list[int], number: Callable[[str], float]
 ) -> tuple[list[tuple[int, str]], list[str]]:
-    """The lines without a first one that holds units or other words, and a remark on
-    it.
-    """
+    """The lines without a first one that holds units or other words, and a remark on it."""
     row, first = rows[0]
     cells = first.split(header.delimiter)
     units = [cells[i] for i in places if cells[i].strip()]

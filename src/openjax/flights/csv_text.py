@@ -1,9 +1,7 @@
-"""The text of a CSV log before its numbers are read: unpacked, decoded, and its header
-found.
+"""The text of a CSV log before its numbers are read: unpacked, decoded, and its header found.
 
-Loggers and spreadsheets put things around a table: comments above the header, Excel's
-`sep=;`, semicolons with decimal commas, UTF-16, a row of units, a comma at the end of
-each line.
+Loggers and spreadsheets put things around a table: comments above the header, Excel's `sep=;`,
+semicolons with decimal commas, UTF-16, a row of units, a comma at the end of each line.
 """
 
 import gzip
@@ -16,8 +14,7 @@ from typing import NamedTuple
 
 from openjax.errors import UserError
 
-# What one log may hold: a quarter of an hour at 1 kHz is 256 MB of text and a million
-# rows.
+# What one log may hold: a quarter of an hour at 1 kHz is 256 MB of text and a million rows.
 LARGEST = 256 << 20  # bytes of text
 MOST_ROWS = 2_000_000
 CHUNK = 1 << 20  # bytes that are unpacked at once
@@ -120,9 +117,7 @@ def _holds_names(line: str) -> bool:
 
 
 def remove_quotes(line: str, delimiter: str) -> str:
-    """A line without quotes around its cells, and without the delimiters that stand in
-    them.
-    """
+    """A line without quotes around its cells, and without the delimiters that stand in them."""
     if '"' not in line:
         return line
     parts = line.split('"')

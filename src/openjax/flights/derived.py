@@ -34,9 +34,8 @@ def derive_velocity(flight: Flight, note) -> Flight:
 
 
 def mend_velocity(flight: Flight, note) -> Flight:
-    """A velocity that somebody differentiated row by row is wrong beside rows that are
-    missing: there it is taken from the position, where it is far off its slope for such
-    rows alone.
+    """A velocity that somebody differentiated row by row is wrong beside rows that are missing:
+    there it is taken from the position, where it is far off its slope for such rows alone.
     """
     if flight.velocity is None or flight.position is None:
         return flight
@@ -69,9 +68,8 @@ def mend_velocity(flight: Flight, note) -> Flight:
 
 
 def _slopes(time: np.ndarray, values: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives (R, C) of values (R, C) by local quadratic fits over 2 `half` + 1
-    rows (Savitzky-Golay, for uneven steps too), and how far in time (R,) each fit
-    reaches.
+    """Derivatives (R, C) of values (R, C) by local quadratic fits over 2 `half` + 1 rows
+    (Savitzky-Golay, for uneven steps too), and how far in time (R,) each fit reaches.
     """
     index = np.clip(np.arange(len(time)), half, len(time) - half - 1)[:, None] + np.arange(
         -half, half + 1

@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-# Channel of a Flight, which is None where it wasn't logged: its columns in the log
-# format.
+# Channel of a Flight, which is None where it wasn't logged: its columns in the log format.
 CHANNEL_COLUMNS = {
     "position": ("x", "y", "z"),
     "quaternion": ("qw", "qx", "qy", "qz"),
@@ -45,10 +44,9 @@ SENSORS = ("position", "quaternion", "velocity", "body_rates", "specific_force")
 class Issue:
     """One finding about a flight's data.
 
-    `flight` is the log's file name (with the vehicle's id where several flew), `issue`
-    says in words what was found, `refused` whether the flight can't be used because of
-    it, and `kind` is a short name of the check. `against` names the comparisons of
-    channels that failed.
+    `flight` is the log's file name (with the vehicle's id where several flew), `issue` says in
+    words what was found, `refused` whether the flight can't be used because of it, and `kind` is a
+    short name of the check. `against` names the comparisons of channels that failed.
     """
 
     flight: str
@@ -139,9 +137,7 @@ class Flight:
         return self.command_thrust is not None and self.command_body_rates is not None
 
     def sampled(self, channel: str) -> tuple[Float[Array, " samples"], Float[Array, "samples ..."]]:
-        """Times (S,) and values (S, ...) of the rows at which `channel` was sampled in
-        full.
-        """
+        """Times (S,) and values (S, ...) of the rows at which `channel` was sampled in full."""
         values = getattr(self, channel)
         if values is None:
             raise ValueError(f"{self.name}: no channel {channel}")
@@ -160,9 +156,8 @@ class Flight:
     def holes(
         self, channel: str, least: float = HOLE, samples: float = 10.0
     ) -> Float[Array, "holes 2"]:
-        """(H, 2) s, begin and end of where `channel` wasn't sampled for so long that no
-        line may stand for it: for more than `least` s, and more than so many of its
-        `samples`.
+        """(H, 2) s, begin and end of where `channel` wasn't sampled for so long that no line may
+        stand for it: for more than `least` s, and more than so many of its `samples`.
         """
         at = np.r_[self.time[0], self.sampled(channel)[0], self.time[-1]]
         steps = np.diff(at)
@@ -172,9 +167,7 @@ class Flight:
     def in_holes(
         self, channels: Iterable[str], least: float = HOLE, samples: float = 10.0
     ) -> Bool[Array, " rows"]:
-        """(T,) which rows lie in a hole, see `holes`, of one of the channels that were
-        logged.
-        """
+        """(T,) which rows lie in a hole, see `holes`, of one of the channels that were logged."""
         inside = np.zeros(len(self), bool)
         for channel in channels:
             if getattr(self, channel) is not None:
@@ -200,9 +193,7 @@ class Flight:
         return out.reshape((len(time), *values.shape[1:]))
 
     def stretches(self, max_step: float | None = None, min_duration: float = 0.0) -> list[slice]:
-        """Slices of rows without a gap in time longer than `max_step` s (default 5 row
-        periods).
-        """
+        """Slices of rows without a gap in time longer than `max_step` s (default 5 row periods)."""
         max_step = 5.0 * self.row_period if max_step is None else max_step
         breaks = np.flatnonzero(np.diff(self.time) > max_step) + 1
         edges = [0, *breaks.tolist(), len(self.time)]
@@ -230,9 +221,7 @@ class Case:
     path: Path | None = None
 
     def others(self, flight: Flight) -> tuple[Flight, ...]:
-        """The other vehicles that flew together with `flight` (neighbours, for
-        downwash).
-        """
+        """The other vehicles that flew together with `flight` (neighbours, for downwash)."""
         return tuple(f for f in self.flights if f.log == flight.log and f.vehicle != flight.vehicle)
 
     def left_out(self) -> tuple[Issue, ...]:

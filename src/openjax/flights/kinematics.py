@@ -1,11 +1,10 @@
-"""Sensors against each other, without any dynamics: what rigid-body kinematics alone
-says about a log.
+"""Sensors against each other, without any dynamics: what rigid-body kinematics alone says about a
+log.
 
-Attitude's rate against the gyroscope gives the gyroscope's gain; the path's
-acceleration against the accelerometer, turned into the world, gives the tilt of the
-world in which motion capture reports. A sensor that is off by more than sensors usually
-are is a finding about the sensors, is corrected before the physics is read, and is no
-cause.
+Attitude's rate against the gyroscope gives the gyroscope's gain; the path's acceleration against
+the accelerometer, turned into the world, gives the tilt of the world in which motion capture
+reports. A sensor that is off by more than sensors usually are is a finding about the sensors, is
+corrected before the physics is read, and is no cause.
 """
 
 import dataclasses
@@ -39,9 +38,7 @@ class Kinematics:
     gain: float
     """Of the gyroscope, 1 where it isn't clearly another."""
     tilt: np.ndarray | None
-    """(2,) rad by which the world leans about its x and y axes; None where that isn't
-    clear.
-    """
+    """(2,) rad by which the world leans about its x and y axes; None where that isn't clear."""
     one_clock: bool
     """True if attitude and gyroscope can be compared sample by sample: what their
     streams leave of each other is noise, not time.
@@ -51,15 +48,12 @@ class Kinematics:
     motor_clock: bool = True
     """The same of motors and gyroscope, see `MotorClock`."""
     motors_late: Mapping[str, float] = field(default_factory=dict)
-    """{flight and vehicle: s by which its motor commands stand later in the log than
-    they act}.
-    """
+    """{flight and vehicle: s by which its motor commands stand later in the log than they act}."""
 
 
 def read_kinematics(tracks: list[Track], limits) -> Kinematics:
-    """Compare the sensors of all tracks of one case. `limits`: `gyroscope_gain` that a
-    sensor may be off by, `world_tilt` in degrees, and the `standard_errors` from which
-    a tilt is clear.
+    """Compare the sensors of all tracks of one case. `limits`: `gyroscope_gain` that a sensor may
+    be off by, `world_tilt` in degrees, and the `standard_errors` from which a tilt is clear.
     """
     streams = _streams(tracks, _turning, BAND)
     gain, error, coherence, turning = _gains(streams)
@@ -98,9 +92,8 @@ def read_kinematics(tracks: list[Track], limits) -> Kinematics:
 
 
 def _of_one_chip(gain: np.ndarray, error: np.ndarray, standard_errors: float) -> float:
-    """The gain of all axes (3,) by their precision, where it differs from 1 by more
-    than so many standard errors, which cover what the axes disagree by (Birge 1932);
-    else 1.
+    """The gain of all axes (3,) by their precision, where it differs from 1 by more than so many
+    standard errors, which cover what the axes disagree by (Birge 1932); else 1.
     """
     is_known = np.isfinite(gain)
     if not is_known.any():
@@ -119,8 +112,7 @@ def _unusual(gain: np.ndarray, error: np.ndarray, usual: float) -> str:
     """
     away = np.abs(gain - 1.0)  # NaN where it isn't known
     off = (away > CLEAR * error) & (away > usual)
-    # of a single axis it may be the calibration of that; two or more say that it is the
-    # unit
+    # of a single axis it may be the calibration of that; two or more say that it is the unit
     if off.sum() < 2:
         return ""
     return ", ".join(f"{a} {g:.3f}" for a, g, o in zip("xyz", gain, off, strict=True) if o)
@@ -209,9 +201,8 @@ def _gains(streams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _wander(streams) -> float:
-    """s (rms) by which the clocks of two signals are apart: an error of time grows with
-    how fast a signal changes, noise doesn't. Least squares over granules, each axis
-    with a noise of its own.
+    """s (rms) by which the clocks of two signals are apart: an error of time grows with how fast a
+    signal changes, noise doesn't. Least squares over granules, each axis with a noise of its own.
     """
     deviations = []
     residuals = []
@@ -233,9 +224,7 @@ def _wander(streams) -> float:
 
 
 def _jackknife(sums: np.ndarray, statistic) -> np.ndarray:
-    """Standard error of a statistic of the sum of `sums` (N, ...), by leaving each
-    out.
-    """
+    """Standard error of a statistic of the sum of `sums` (N, ...), by leaving each out."""
     left_out = np.array([statistic(sums.sum(0) - s) for s in sums])
     return np.sqrt((len(sums) - 1) / len(sums) * ((left_out - left_out.mean(0)) ** 2).sum(0))
 

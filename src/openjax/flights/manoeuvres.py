@@ -21,10 +21,9 @@ class Reference:
 def references(
     seed: int = 0, duration: float = 10.0, neighbour: bool = False
 ) -> dict[str, Reference]:
-    """Three flights that expose a vehicle: waypoints down to 6 cm above the floor and
-    near 1.1 m, a fast Lissajous figure with turning yaw, and doublets on every axis
-    around hover, from a full to a low battery. With `neighbour` a second vehicle sweeps
-    back and forth 35 to 55 cm above.
+    """Three flights that expose a vehicle: waypoints down to 6 cm above the floor and near 1.1 m, a
+    fast Lissajous figure with turning yaw, and doublets on every axis around hover, from a full to
+    a low battery. With `neighbour` a second vehicle sweeps back and forth 35 to 55 cm above.
     """
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, duration, PERIOD)

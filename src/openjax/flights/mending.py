@@ -70,26 +70,21 @@ def mend(signals: Signals, bad: list[SignalPair]) -> tuple[str, str] | None:
 
 
 def convention_of(signals: Signals, bad: list[SignalPair]) -> str:
-    """Of another program's conventions one that makes the disagreeing pairs agree, in
-    words.
-    """
+    """Of another program's conventions one that makes the disagreeing pairs agree, in words."""
     others = ((c.words, c.convert(signals)) for c in CONVENTIONS)
     return next((w for w, other in others if upright(other) and agrees(other, bad)), "")
 
 
 def by_conventions(signals: Signals) -> Iterator[tuple[str, Signals]]:
-    """(what is wrong, the signals without it) by each usual convention of the
-    quaternion.
-    """
+    """(what is wrong, the signals without it) by each usual convention of the quaternion."""
     for words, convert in QUATERNIONS.items():
         attitude = convert(signals.quaternion)
         yield words, dataclasses.replace(signals, quaternion=attitude)
 
 
 def attitudes(signals: Signals) -> Iterator[tuple[str, np.ndarray]]:
-    """(what is wrong, the attitude (T, 4) without it): the usual conventions, other
-    signs of the angles, and any order of the quaternion, where the gyroscope says how
-    it must turn.
+    """(what is wrong, the attitude (T, 4) without it): the usual conventions, other signs of the
+    angles, and any order of the quaternion, where the gyroscope says how it must turn.
     """
     for words, convert in QUATERNIONS.items():
         yield words, convert(signals.quaternion)

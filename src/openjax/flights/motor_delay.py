@@ -1,11 +1,10 @@
-"""True if motors are quick or slow, or their commands on another clock: lag and delay
-told apart.
+"""True if motors are quick or slow, or their commands on another clock: lag and delay told apart.
 
-Both turn the phase of the answer, and only a lag bends its gain, too. In closed loop gusts
-turn the body and motors answer them, so that phases and gains of spectra are biased; errors
-of a prediction one row ahead aren't (Ljung, System Identification, 13.4). For each of some
-lags and delays the row's change of the body rates is predicted by the torques that the
-motors make in it, with an autoregression for what else turns the body.
+Both turn the phase of the answer, and only a lag bends its gain, too. In closed loop gusts turn the
+body and motors answer them, so that phases and gains of spectra are biased; errors of a prediction
+one row ahead aren't (Ljung, System Identification, 13.4). For each of some lags and delays the
+row's change of the body rates is predicted by the torques that the motors make in it, with an
+autoregression for what else turns the body.
 """
 
 from collections.abc import Sequence
@@ -77,9 +76,8 @@ def lag_and_delay(
 
 
 def row_torques(motor: np.ndarray, place: np.ndarray, lag: float, dt: float) -> np.ndarray:
-    """Torques (T, 2) in roll and pitch, but for their unit, that motors make in each row
-    through their lag: the mean over the row of a first-order answer to a command that is
-    held.
+    """Torques (T, 2) in roll and pitch, but for their unit, that motors make in each row through
+    their lag: the mean over the row of a first-order answer to a command that is held.
     """
     decay = np.exp(-dt / lag)
     response = lfilter([1.0 - decay], [1.0, -decay], motor, axis=0, zi=decay * motor[:1])[0]
@@ -129,9 +127,7 @@ def _white(values: np.ndarray, whitening: np.ndarray) -> np.ndarray:
 
 
 def _whitening(errors: list[np.ndarray]) -> np.ndarray:
-    """The filters (2, ORDER + 1) that leave nothing of errors (2, T) that those before
-    tell.
-    """
+    """The filters (2, ORDER + 1) that leave nothing of errors (2, T) that those before tell."""
     filters = []
     for k in range(2):
         axis = [e[k] for e in errors]

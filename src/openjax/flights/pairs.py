@@ -1,8 +1,7 @@
 """Pairs of a flight's channels that must follow each other, and how well they do.
 
-Each pair is compared in a low band, with a clock offset free for every few seconds, and
-speaks only where the one that leads moves by more than sensors, latencies and the air
-explain.
+Each pair is compared in a low band, with a clock offset free for every few seconds, and speaks only
+where the one that leads moves by more than sensors, latencies and the air explain.
 """
 
 from __future__ import annotations
@@ -50,9 +49,7 @@ MOVED = {
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """A flight's channels (T, C) on the common clock; None where they weren't
-    logged.
-    """
+    """A flight's channels (T, C) on the common clock; None where they weren't logged."""
 
     position: np.ndarray | None
     quaternion: np.ndarray | None
@@ -105,11 +102,10 @@ class Signals:
 
 @dataclass(frozen=True, eq=False)
 class SignalPair:
-    """`signal` (T, C) and what it must agree with, both in `unit`. `names` of the
-    measured columns; `holds` the channel of `Signals` that they are, where another
-    labelling of it may be right; `derivatives`: how many times each was differentiated
-    from what its sensor gives, None for commands; `least`: rms of the reference in the
-    band from which it tells.
+    """`signal` (T, C) and what it must agree with, both in `unit`. `names` of the measured columns;
+    `holds` the channel of `Signals` that they are, where another labelling of it may be right;
+    `derivatives`: how many times each was differentiated from what its sensor gives, None for
+    commands; `least`: rms of the reference in the band from which it tells.
     """
 
     names: tuple[str, ...]
@@ -327,9 +323,8 @@ def agreement(
     band: tuple[float, float],
     derivatives: tuple[int | None, int | None] = (0, 0),
 ) -> Agreement:
-    """Compare (T, C) with (T, C) on the common clock in `band` Hz. `derivatives` says
-    how many times each was differentiated from what its sensor gives; None: a command,
-    which has no noise.
+    """Compare (T, C) with (T, C) on the common clock in `band` Hz. `derivatives` says how many
+    times each was differentiated from what its sensor gives; None: a command, which has no noise.
     """
     y = in_band(signal, band)
     x = in_band(reference, band)
@@ -363,9 +358,7 @@ def agreement(
 
 
 def _noise(values: np.ndarray, band: tuple[float, float], derivatives: int | None) -> np.ndarray:
-    """Noise (C,) in the band, if all above 20 Hz is the white noise of what was
-    differentiated.
-    """
+    """Noise (C,) in the band, if all above 20 Hz is the white noise of what was differentiated."""
     if derivatives is None:
         return np.zeros(values.shape[1])
     # up to a tenth below the highest frequency of the clock

@@ -1,10 +1,8 @@
-"""Plans of set-points as CSV files: rows of 10 ms, for `openjax fly --plan` and for
-Crazyswarm2.
+"""Plans of set-points as CSV files: rows of 10 ms, for `openjax fly --plan` and for Crazyswarm2.
 
 Columns: t (s); x, y, z (m), vx, vy, vz (m/s), ax, ay, az (m/s^2), world; yaw (rad), as
-Crazyswarm2's `cmdFullState` takes them; then what is added to the commands of a
-controller of thrust and body rates: thrust (share of the largest), wx, wy, wz (rad/s);
-segment's name.
+Crazyswarm2's `cmdFullState` takes them; then what is added to the commands of a controller of
+thrust and body rates: thrust (share of the largest), wx, wy, wz (rad/s); segment's name.
 """
 
 from collections.abc import Iterable

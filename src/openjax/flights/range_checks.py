@@ -19,9 +19,7 @@ NOWHERE = 20.0
 
 
 def _of_unit_length(quaternion: np.ndarray, note) -> np.ndarray:
-    """Quaternions (T, 4) normalised, without flips; those far from unit length are not
-    sampled.
-    """
+    """Quaternions (T, 4) normalised, without flips; those far from unit length are not sampled."""
     norm = np.linalg.norm(quaternion, axis=1)
     norm[norm == 0.0] = np.nan
     off = np.abs(norm - 1.0)

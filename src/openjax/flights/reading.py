@@ -46,9 +46,8 @@ class LogTable:
 def flights_of(
     table: LogTable, motor_permutation: tuple[int, ...] = (0, 1, 2, 3)
 ) -> tuple[list[Flight], list[str]]:
-    """The table's flights, one per vehicle, as logged (not yet sorted, checked or cut),
-    motors in the nominal order; and remarks on columns that couldn't be used. Raises
-    LogError without time.
+    """The table's flights, one per vehicle, as logged (not yet sorted, checked or cut), motors in
+    the nominal order; and remarks on columns that couldn't be used. Raises LogError without time.
     """
     if "t" not in table.columns:
         raise LogError(
@@ -71,8 +70,7 @@ def flights_of(
     flights = []
     for vehicle_id in ids:
         rows = np.flatnonzero(table.vehicle == vehicle_id)
-        # in the long format a vehicle's rows hold what it logged, and nothing of the
-        # others'
+        # in the long format a vehicle's rows hold what it logged, and nothing of the others'
         arrays = {c: v[rows] for c, v in channels.items() if not np.isnan(v[rows]).all()}
         name = table.name if len(ids) == 1 else f"{table.name}:{vehicle_id}"
         time = table.columns["t"][rows]

@@ -1,6 +1,4 @@
-"""Parts of a flight by what the vehicle does: where it is, how fast, how hard its
-motors work.
-"""
+"""Parts of a flight by what the vehicle does: where it is, how fast, how hard its motors work."""
 
 import numpy as np
 

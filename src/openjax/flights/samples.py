@@ -216,9 +216,8 @@ def _fly(
 
 
 def _physics(vehicle, effects, parameters, drone: DroneState, motor_command, context, gust):
-    """One physics step of one drone; its state, and the force without gravity in the
-    body frame (3,) N. `gust` (6,): force in the world's axes and torque of turbulent
-    air, or None.
+    """One physics step of one drone; its state, and the force without gravity in the body frame
+    (3,) N. `gust` (6,): force in the world's axes and torque of turbulent air, or None.
     """
     motor_command = composition.change_motor_command(effects, parameters, motor_command, context)
     speed = rotor_speed_step(vehicle, drone.rotor_speed, motor_command, context.dt)

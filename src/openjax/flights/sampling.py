@@ -69,9 +69,7 @@ def drop_frozen(flight: Flight, note) -> Flight:
 
 
 def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
-    """(T,) rows in which a sensor is frozen; of columns that never change nothing can
-    be used.
-    """
+    """(T,) rows in which a sensor is frozen; of columns that never change nothing can be used."""
     columns = CHANNEL_COLUMNS[channel]
     values = getattr(flight, channel)
     table = values.reshape(len(values), -1)
@@ -98,9 +96,8 @@ def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
 
 
 def _may_stand_still(flight: Flight, channel: str, column: int) -> bool:
-    """True if one column may hold one value while the others of its channel change, as
-    where a simulated vehicle stays in a plane: what follows from it then stands still,
-    too.
+    """True if one column may hold one value while the others of its channel change, as where a
+    simulated vehicle stays in a plane: what follows from it then stands still, too.
     """
     other = {"position": "velocity", "velocity": "position"}.get(channel)
     if other is None:
@@ -143,9 +140,8 @@ def drop_held_rows(flight: Flight, note) -> Flight:
 
 
 def drop_repeats(flight: Flight, note) -> Flight:
-    """A sensor that is slower than the rows and whose last sample was written again
-    counts as sampled where it changed. A sample that appears in a row may be older than
-    it by up to a row.
+    """A sensor that is slower than the rows and whose last sample was written again counts as
+    sampled where it changed. A sample that appears in a row may be older than it by up to a row.
     """
     changes = {}
     for group in (("position", "quaternion", "velocity"), ("body_rates", "specific_force")):
@@ -169,10 +165,9 @@ def drop_repeats(flight: Flight, note) -> Flight:
 
 
 def put_in_step(flight: Flight, note) -> Flight:
-    """Poses at the times of their rows, where the camera is slower than the log: a row
-    says only that a new pose came since the last one, and the camera's own clock is
-    regular. Poses are on a line through their rows; a held one is half a row late on
-    the mean.
+    """Poses at the times of their rows, where the camera is slower than the log: a row says only
+    that a new pose came since the last one, and the camera's own clock is regular. Poses are on a
+    line through their rows; a held one is half a row late on the mean.
     """
     channels = [c for c in ("position", "quaternion", "velocity") if getattr(flight, c) is not None]
     if not channels:
@@ -271,8 +266,6 @@ def _frozen(table: np.ndarray, rows: np.ndarray, time: np.ndarray, as_one: bool)
 
 
 def runs_of(flags: Chosen) -> list[tuple[int, int]]:
-    """First row and the one after the last of every stretch in which `flags` (T,)
-    hold.
-    """
+    """First row and the one after the last of every stretch in which `flags` (T,) hold."""
     edges = np.flatnonzero(np.diff(np.r_[0, flags, 0]))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

@@ -1,6 +1,4 @@
-"""Signals of a flight on one even clock, for the checks that compare channels with each
-other.
-"""
+"""Signals of a flight on one even clock, for the checks that compare channels with each other."""
 
 from functools import lru_cache
 
@@ -22,9 +20,8 @@ FADE = 0.5  # s
 
 
 def clock_of(flight: Flight) -> Times | None:
-    """The common clock over the longest stretch without gaps, and without holes in a
-    channel, over which nothing may be drawn; None if that is too short to tell
-    anything.
+    """The common clock over the longest stretch without gaps, and without holes in a channel, over
+    which nothing may be drawn; None if that is too short to tell anything.
     """
     steps = np.diff(flight.time)
     long_steps = np.flatnonzero(steps > max(0.1, 5 * flight.row_period))
@@ -73,8 +70,7 @@ def in_band(values: Columns, band: tuple[float, float]) -> Float[np.ndarray, "in
     """
     # rows at the ends where filter and differences aren't trustworthy
     edge = min(20, len(values) // 8)
-    # faded in and out: a filter this slow would carry the last row's noise far into the
-    # flight
+    # faded in and out: a filter this slow would carry the last row's noise far into the flight
     fade = _fade(len(values))[:, None]
     signal = fade * (values - values.mean(0))
     return sosfiltfilt(_bandpass(band), signal, axis=0)[edge:-edge]
@@ -91,18 +87,14 @@ def _fade(rows: int) -> np.ndarray:
 
 
 def rates_of(quaternion: Quaternions) -> Vectors:
-    """Body rates (T, 3) rad/s of attitudes (T, 4) on the common clock, by central
-    differences.
-    """
+    """Body rates (T, 3) rad/s of attitudes (T, 4) on the common clock, by central differences."""
     attitude = Rotation.from_quat(quaternion, scalar_first=True)
     rates = (attitude[:-2].inv() * attitude[2:]).as_rotvec() * RATE / 2
     return np.concatenate([rates[:1], rates, rates[-1:]])
 
 
 def first_order(values: Columns, time_constant: float) -> Columns:
-    """`values` (T, C) behind a first-order lag of `time_constant` s, settled at the
-    start.
-    """
+    """`values` (T, C) behind a first-order lag of `time_constant` s, settled at the start."""
     blend = -np.expm1(-1 / (RATE * time_constant))
     start = (1.0 - blend) * values[:1]
     return lfilter([0.0, blend], [1.0, blend - 1.0], values, axis=0, zi=start)[0]

@@ -78,9 +78,7 @@ def _sort(flight: Flight, note) -> Flight:
 
 
 def _written_once(flight: Flight, note) -> Flight:
-    """Without rows that repeat the one before in every column, as where a log was
-    written twice.
-    """
+    """Without rows that repeat the one before in every column, as where a log was written twice."""
     channels = [getattr(flight, c) for c in CHANNEL_COLUMNS if getattr(flight, c) is not None]
     table = np.column_stack([flight.time, *(v.reshape(len(v), -1) for v in channels)])
     same = (table[1:] == table[:-1]) | (np.isnan(table[1:]) & np.isnan(table[:-1]))

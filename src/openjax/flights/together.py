@@ -27,9 +27,7 @@ OVERLAP = 0.5  # share of the shorter flight in which both fly
 
 
 def join(logs: Logs) -> tuple[Logs, list[Issue]]:
-    """The logs with vehicles that flew together as flights of one log, and what was
-    found.
-    """
+    """The logs with vehicles that flew together as flights of one log, and what was found."""
     single = [flights[0] for flights, _ in logs if len(flights) == 1]
     issues = []
     changes: dict[str, Flight] = {}

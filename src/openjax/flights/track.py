@@ -45,9 +45,8 @@ TAKE_OFF = 1.0  # s after a take-off and before a landing in which the floor sti
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One stretch of one vehicle's flight, T rows of period `dt`. Units and frames are
-    those of `Flight`; motors are fractions of the maximal rotor thrust. What wasn't
-    logged is None.
+    """One stretch of one vehicle's flight, T rows of period `dt`. Units and frames are those of
+    `Flight`; motors are fractions of the maximal rotor thrust. What wasn't logged is None.
     """
 
     name: str

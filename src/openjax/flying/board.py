@@ -1,10 +1,9 @@
 """The shared state of a flight's three processes: a page of shared memory that outlives any of
 them.
 
-The loop flies through the links. If it falls silent the links' process lands the
-vehicles; if that one is silent too the guard does, over links of its own; if both are
-gone the loop does. Whoever flies writes its state here, so that the next one can go on
-from it.
+The loop flies through the links. If it falls silent the links' process lands the vehicles; if that
+one is silent too the guard does, over links of its own; if both are gone the loop does. Whoever
+flies writes its state here, so that the next one can go on from it.
 """
 
 import contextlib
@@ -21,9 +20,8 @@ from openjax.interruption import SIGNALS
 SILENCE = 0.1
 """Silence of a process after which the next one flies (s): ten ticks."""
 _MODES = tuple(Mode)
-# Where things stand in the page: five words, a beat and a process id of each of the
-# three roles, and then of each vehicle mode, trim, whether it has a pose, and the 14
-# numbers of that.
+# Where things stand in the page: five words, a beat and a process id of each of the three roles,
+# and then of each vehicle mode, trim, whether it has a pose, and the 14 numbers of that.
 _BEATS = 5
 _PIDS = 8
 _HEAD = 11
@@ -120,8 +118,7 @@ class Board:
             numbers += [float(_MODES.index(drone.mode)), drone.trim, float(has_estimate), *pose]
         self._numbers[_HEAD:] = numbers
         self.flying = state.flying
-        # the beat comes last: who takes over for a silent process finds a page that is
-        # whole
+        # the beat comes last: who takes over for a silent process finds a page that is whole
         self.beat(role, time)
 
     def read(self, state: State, time: float) -> State:
@@ -139,12 +136,10 @@ class Board:
 
 
 def start_deaf(process) -> None:
-    """Start a process of multiprocessing that no Ctrl-C ends, in many lines, while it
-    loads what it needs: signals that are blocked here are blocked there until it can
-    `stand_alone`.
+    """Start a process of multiprocessing that no Ctrl-C ends, in many lines, while it loads what it
+    needs: signals that are blocked here are blocked there until it can `stand_alone`.
     """
-    # Python starts its resource tracker with the first process, and unblocks signals
-    # for it
+    # Python starts its resource tracker with the first process, and unblocks signals for it
     resource_tracker.ensure_running()
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:

@@ -1,14 +1,13 @@
 """Compare a vehicle's estimated climb with the one that its accelerometer feels.
 
-A height that drifts together with its velocity looks like flight to thrust and
-attitude: the floor's cushion, another vehicle's wake and an emptier battery accelerate
-by as much. The accelerometer feels all of these. What it doesn't feel are its own
-offset, which is learnt in flight, and an error of the attitude, which counts upwards
-only by its square. So what the estimate climbs beyond it is summed up, smoothed over a
-pause in which clocks may differ, and bounded.
+A height that drifts together with its velocity looks like flight to thrust and attitude: the
+floor's cushion, another vehicle's wake and an emptier battery accelerate by as much. The
+accelerometer feels all of these. What it doesn't feel are its own offset, which is learnt in
+flight, and an error of the attitude, which counts upwards only by its square. So what the estimate
+climbs beyond it is summed up, smoothed over a pause in which clocks may differ, and bounded.
 
-Along the ground the attitude's error counts in full, .17 m/s^2 a degree: there the
-accelerometer tells no more than thrust does.
+Along the ground the attitude's error counts in full, .17 m/s^2 a degree: there the accelerometer
+tells no more than thrust does.
 """
 
 import math

@@ -99,9 +99,7 @@ def nominal_airframe() -> Airframe:
 
 
 def roll_pitch_yaw(quaternion) -> Vector:
-    """Angles (rad) of a quaternion wxyz, in the order yaw, pitch, roll about moving
-    axes.
-    """
+    """Angles (rad) of a quaternion wxyz, in the order yaw, pitch, roll about moving axes."""
     w, x, y, z = quaternion
     return (
         math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
@@ -130,9 +128,7 @@ def up(quaternion) -> float:
 
 
 def level_acceleration(quaternion) -> Vector:
-    """The acceleration (m/s^2, world) of a vehicle at this attitude that holds its
-    height.
-    """
+    """The acceleration (m/s^2, world) of a vehicle at this attitude that holds its height."""
     # at more than 72 degrees no rotor holds it; .3 keeps the number finite
     return lift_acceleration(quaternion, 1.0 / max(up(quaternion), 0.3))
 
@@ -172,8 +168,7 @@ def turned_on(quaternion, rates: Vector, duration: float) -> tuple[float, float,
 
 def angle_between(a, b) -> float:
     """The angle (rad) of the rotation between two unit quaternions wxyz."""
-    # the absolute value, since q and -q are one attitude; cut, since rounding may leave
-    # more than 1
+    # the absolute value, since q and -q are one attitude; cut, since rounding may leave more than 1
     cosine = abs(sum(p * q for p, q in zip(a, b, strict=True)))
     return 2.0 * math.acos(min(cosine, 1.0))
 

@@ -24,12 +24,11 @@ def send_set_point(crazyflie, set_point: SetPoint) -> None:
 
 
 def never_wait(link) -> None:
-    """Have packets wait for a link, and never who sends them: the newest of each kind,
-    in the place of an older one.
+    """Have packets wait for a link, and never who sends them: the newest of each kind, in the place
+    of an older one.
 
-    A radio's link has room for one until its vehicle acknowledges; `cflib` waits two
-    seconds for a vehicle that doesn't, and meanwhile sends the others nothing. Over UDP
-    nothing waits.
+    A radio's link has room for one until its vehicle acknowledges; `cflib` waits two seconds for a
+    vehicle that doesn't, and meanwhile sends the others nothing. Over UDP nothing waits.
     """
     room = getattr(link, "out_queue", None)
 

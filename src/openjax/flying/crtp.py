@@ -1,10 +1,8 @@
-"""CRTP, the protocol between a Crazyflie and a ground station: ports, types, packed
-numbers.
+"""CRTP, the protocol between a Crazyflie and a ground station: ports, types, packed numbers.
 
 Facts from Bitcraze's protocol documentation
 (https://www.bitcraze.io/documentation/repository/crazyflie-firmware/
-master/functional-areas/crtp/); a packet is one byte of header and up to 30 bytes of
-data.
+master/functional-areas/crtp/); a packet is one byte of header and up to 30 bytes of data.
 """
 
 import math
@@ -17,9 +15,7 @@ PROTOCOL_VERSION = 12
 supervisor's port (12).
 """
 MAX_LOG_DATA = 26
-"""Bytes of variables in one log packet; the rest is the block's id and the time
-stamp.
-"""
+"""Bytes of variables in one log packet; the rest is the block's id and the time stamp."""
 FULL_SCALE = 65535
 """Motor commands, thrust set-points: 16 bit."""
 
@@ -61,9 +57,7 @@ class SupervisorCommand(IntEnum):
 
 
 class LogCommand(IntEnum):
-    """First byte of a packet on the log port's channel 1, with 16-bit ids of
-    variables.
-    """
+    """First byte of a packet on the log port's channel 1, with 16-bit ids of variables."""
 
     DELETE = 2
     START = 3  # with a period in units of 10 ms
@@ -82,9 +76,7 @@ class Packet(NamedTuple):
     data: bytes
 
     def encode(self) -> bytes:
-        """The packet as it is sent. The two middle bits of the header are set, as
-        ever.
-        """
+        """The packet as it is sent. The two middle bits of the header are set, as ever."""
         return bytes([(self.port << 4) | 0x0C | self.channel]) + self.data
 
 
@@ -133,11 +125,9 @@ def compress_quaternion(wxyz) -> int:
     word = largest
     for i, value in enumerate(xyzw):
         if i != largest:
-            # q and -q are one attitude: signs are those of the one whose largest is
-            # positive
+            # q and -q are one attitude: signs are those of the one whose largest is positive
             negative = int((value < 0) != (xyzw[largest] < 0))
-            # a component that isn't the largest is at most 1 / sqrt(2), for which 511
-            # stands
+            # a component that isn't the largest is at most 1 / sqrt(2), for which 511 stands
             size_in_bits = min(round(511 * abs(value) / size * 2**0.5), 511)
             word = word << 10 | negative << 9 | size_in_bits
     return word

@@ -1,14 +1,13 @@
 """Detect a gentle drift of a vehicle's estimated velocity by comparison with its teammates.
 
-While a drift sets in, the estimate accelerates as thrust and attitude don't explain. So
-do the air's drag, which nobody told the vehicle, and an attitude that is off by a tenth
-of a degree. A constant and a drag for each level axis are therefore learnt in flight,
-by least squares that forget (Ljung 1999, "System identification", 11.2), and what they
-leave is summed up. How large such sums are where nothing drifts, the teammates say:
-they fly alike, in the same air.
+While a drift sets in, the estimate accelerates as thrust and attitude don't explain. So do the
+air's drag, which nobody told the vehicle, and an attitude that is off by a tenth of a degree. A
+constant and a drag for each level axis are therefore learnt in flight, by least squares that forget
+(Ljung 1999, "System identification", 11.2), and what they leave is summed up. How large such sums
+are where nothing drifts, the teammates say: they fly alike, in the same air.
 
-The height is left out. There the floor's cushion, another vehicle's wake and an emptier
-battery accelerate by more than a drift does.
+The height is left out. There the floor's cushion, another vehicle's wake and an emptier battery
+accelerate by more than a drift does.
 """
 
 import math
@@ -30,9 +29,7 @@ LEARNT = 4.0
 drag are known yet.
 """
 SPREAD = 0.05
-"""Information that never fades, so that a vehicle at rest is taken to have no drag
-(m^2/s^2).
-"""
+"""Information that never fades, so that a vehicle at rest is taken to have no drag (m^2/s^2)."""
 FLOOR = 0.15
 """Smaller sums (m/s) are no drift, whatever the teammates' are: an attitude's error of
 .2 degrees that comes within the window accelerates by .05 m/s.
@@ -81,9 +78,7 @@ class Drift(NamedTuple):
     age: float = 0.0  # s
 
     def update(self, residual: Vector, velocity: Vector, dt: float) -> "Drift":
-        """After `dt` (s) with an acceleration (m/s^2, world) that thrust didn't
-        explain.
-        """
+        """After `dt` (s) with an acceleration (m/s^2, world) that thrust didn't explain."""
         # x and y of the velocity; the third, the height, is left out
         level = list(zip(self.fits, residual, velocity, strict=False))
         decay = math.exp(-dt / WINDOW)
@@ -103,9 +98,7 @@ class Drift(NamedTuple):
 
     @property
     def usual(self) -> float:
-        """Root mean square of its sums (m/s); infinite before they are worth
-        something.
-        """
+        """Root mean square of its sums (m/s); infinite before they are worth something."""
         seconds = self.age - LEARNT
         return math.sqrt(self.squares / seconds) if seconds > 1.0 else math.inf
 

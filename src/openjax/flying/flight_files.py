@@ -1,10 +1,9 @@
 """The files that a flight leaves behind: a case that `openjax diagnose` reads, and `flight.json`
 about the flight.
 
-One log per game, with all vehicles in it: a row for each moment at which something was
-sampled on board. Commands are those in force at that moment, as sent: body rates and
-thrust. A log grows while its game is flown; each piece is a gzip member of its own, so
-what is there can be read.
+One log per game, with all vehicles in it: a row for each moment at which something was sampled on
+board. Commands are those in force at that moment, as sent: body rates and thrust. A log grows while
+its game is flown; each piece is a gzip member of its own, so what is there can be read.
 """
 
 import contextlib
@@ -157,8 +156,7 @@ class GameLog:
         commands: np.ndarray,
         until: float,
     ) -> bytes:
-        """The rows after the last piece and up to `until` (s), packed; empty where
-        there are none.
+        """The rows after the last piece and up to `until` (s), packed; empty where there are none.
 
         Args:
           samples: what was recorded of each vehicle.
@@ -203,16 +201,13 @@ class _Source(NamedTuple):
 
 
 def _sources(vehicle: VehicleSamples) -> list[_Source]:
-    """All that was recorded of a vehicle; what comes later replaces what came
-    before.
-    """
+    """All that was recorded of a vehicle; what comes later replaces what came before."""
     own_poses = np.column_stack([vehicle.poses[:, 3:], vehicle.poses[:, 1]])
     poses = _Source(vehicle.poses[:, 2], (*_POSE, "vbat"), own_poses)
     bodies = _Source(vehicle.bodies[:, 0], _BODY, vehicle.bodies[:, 1:])
     if not len(vehicle.seen):
         return [poses, bodies]
-    # motion capture in place of the estimate on board, of which body rates and voltage
-    # stay
+    # motion capture in place of the estimate on board, of which body rates and voltage stay
     poses = _Source(poses.time, poses.names[10:], own_poses[:, 10:])
     capture = _Source(vehicle.seen[:, 0], _POSE[:10], vehicle.seen[:, 1:11])
     return [poses, bodies, capture]

@@ -76,8 +76,7 @@ class FlightRecord:
         """
         row = array("d", tick)
         for arrival, measured_at, s in zip(arrivals, measured_times, set_points, strict=True):
-            # what a packet holds, not what was asked for: a diagnosis must know what
-            # was sent
+            # what a packet holds, not what was asked for: a diagnosis must know what was sent
             s = s if s.mode == OFF else as_sent(s)
             row.extend((arrival, measured_at, s.mode, s.thrust, s.roll, s.pitch, s.yaw_rate))
         self._rows.extend(row)

@@ -30,24 +30,21 @@ class Play(NamedTuple):
     breaches: np.ndarray  # (N,)
     crashed: np.ndarray  # (N,)
     draws: tuple[float, ...] = ()
-    """At the start of an episode: from 0 to 1, by which the team chooses the strategies
-    that it flies one after another (`openjax.pursuit.teams.strategy_of`); empty where it
-    has one.
+    """At the start of an episode: from 0 to 1, by which the team chooses the strategies that it
+    flies one after another (`openjax.pursuit.teams.strategy_of`); empty where it has one.
     """
 
 
 def game_functions(policy):
-    """The game's settings and airframe, and its two steps as pure functions of arrays,
-    to compile or to map.
+    """The game's settings and airframe, and its two steps as pure functions of arrays, to compile
+    or to map.
 
-    first(task, poses (N, 13), seed ()) -> state, action (N, 4): an episode begins with
-    the pursuers at `poses`; the seed draws which strategies a team flies that draws
-    them. tick(state, action, poses, evader (3,), evader_measured ()) ->
-    state, action, *fields of `Play` but the first: one control step later they are at
-    `poses`.
+    first(task, poses (N, 13), seed ()) -> state, action (N, 4): an episode begins with the pursuers
+    at `poses`; the seed draws which strategies a team flies that draws them. tick(state, action,
+    poses, evader (3,), evader_measured ()) -> state, action, *fields of `Play` but the first: one
+    control step later they are at `poses`.
     """
-    # what shapes a training world, but not a measured one: the vehicles drawn for it,
-    # the clamp
+    # what shapes a training world, but not a measured one: the vehicles drawn for it, the clamp
     settings = dataclasses.replace(policy.settings.environment, vehicles=(), speed_limit="none")
     environment = Pursuit(settings)
 
@@ -119,8 +116,7 @@ class Game:
         nowhere = np.zeros(3, np.float32)
         not_measured = np.zeros((), bool)
 
-        # the state as one array: as a tree of some thirty the call takes half as long
-        # again
+        # the state as one array: as a tree of some thirty the call takes half as long again
         def begin(poses, seed):
             state, action = first(task, poses, seed)
             none = np.zeros(0, np.float32)

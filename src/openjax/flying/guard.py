@@ -30,8 +30,7 @@ firmware's watchdog waits.
 
 
 class Guard:
-    """The loop's end of the guard's process: start it before take-off, close it at the
-    end.
+    """The loop's end of the guard's process: start it before take-off, close it at the end.
 
     Args:
       board: of the session.

@@ -52,9 +52,7 @@ SINKING = 0.7
 2020) on 30 g.
 """
 STEP = 0.2
-"""Of one pose's velocity against thrust (m/s): no wake pushes so much between two
-poses.
-"""
+"""Of one pose's velocity against thrust (m/s): no wake pushes so much between two poses."""
 TURN = Memory(1.0, 0.08)
 """Of attitude against gyroscope (rad): one is off the other by .08 rad/s."""
 RATE = Memory(0.2, 1.5)
@@ -72,15 +70,11 @@ vehicle whose estimate is refused flies on without that.
 RATE_LAG = 0.04
 """Time constant of the rate loop (s)."""
 LONGEST = 0.025
-"""After a longer pause (s) between two poses nobody knows what happened: no
-innovation.
-"""
+"""After a longer pause (s) between two poses nobody knows what happened: no innovation."""
 
 
 class Innovations(NamedTuple):
-    """The sums of one source of a vehicle's poses, and what the next ones are made
-    of.
-    """
+    """The sums of one source of a vehicle's poses, and what the next ones are made of."""
 
     pose: Pose | None = None
     way: Vector = ZERO  # m, world
@@ -220,9 +214,7 @@ def _beyond_thrust(last: Pose, pose: Pose, thrust: float, airframe: Airframe) ->
 
 
 def _turn_beyond_gyroscope(last: Pose, pose: Pose) -> Vector:
-    """The turn (rad, body) from one pose to the next that the gyroscope doesn't
-    tell.
-    """
+    """The turn (rad, body) from one pose to the next that the gyroscope doesn't tell."""
     mean = _towards(last.body_rates, pose.body_rates, 0.5)
     turn = turn_between(last.quaternion, pose.quaternion)
     return _difference(turn, _times(pose.time - last.time, mean))

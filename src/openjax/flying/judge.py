@@ -1,9 +1,8 @@
 """Judge whether a pose may be flown by: a measurement against what a vehicle can have done since
 the last good one.
 
-`judge` compares a pose with the last good one of the same source, `offset_of` motion
-capture with the vehicle's own estimate. Both are pure. What they don't accept is a lost
-pose, whatever sent it.
+`judge` compares a pose with the last good one of the same source, `offset_of` motion capture with
+the vehicle's own estimate. Both are pure. What they don't accept is a lost pose, whatever sent it.
 """
 
 import math
@@ -52,15 +51,11 @@ class PoseLimits:
     body_rate: float = math.radians(2000.0)
     """Full scale of the gyroscope on board (rad/s); BMI088 data sheet."""
     horizon: float = 0.06
-    """Time (s) for which a vehicle is flown without a good pose;
-    `SafetySettings.pose_timeout`.
-    """
+    """Time (s) for which a vehicle is flown without a good pose; `SafetySettings.pose_timeout`."""
     drift: float = 0.25
     """Error of the reckoned velocity (m/s): 1.5 degrees of tilt for a second."""
     position: float = 0.03
-    """Error of one position (m): three times what `locSrv.extPosStdDev` is set to on
-    board.
-    """
+    """Error of one position (m): three times what `locSrv.extPosStdDev` is set to on board."""
     velocity: float = 0.3
     """Error of one velocity (m/s): half of a position's error in the time constant of
     the velocity's low-pass.

@@ -24,9 +24,8 @@ often they come.
 class Operator:
     """Keys and signals while vehicles fly; a context manager.
 
-    Space or q stops all motors, l lands, h waits; signals land. Keys are read byte by
-    byte from the terminal itself, and of all that have come since the last look the
-    strongest counts.
+    Space or q stops all motors, l lands, h waits; signals land. Keys are read byte by byte from the
+    terminal itself, and of all that have come since the last look the strongest counts.
 
     Args:
       terminal: a file descriptor; keys are read only if it is a terminal.
@@ -57,8 +56,7 @@ class Operator:
         return self
 
     def __exit__(self, *_):
-        # what has come by now was this object's to hear, and mustn't be taken for an
-        # unheard signal
+        # what has come by now was this object's to hear, and mustn't be taken for an unheard signal
         settle()
         self._restore.close()
 

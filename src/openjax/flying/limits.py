@@ -22,9 +22,7 @@ WALL_RETURN = 0.5
 CEILING_RETURN = 0.4
 """... and from ceiling or floor."""
 FASTEST_PUSH = 0.5
-"""Vehicles that are too close part by at most this (m/s) beyond what they close in
-by.
-"""
+"""Vehicles that are too close part by at most this (m/s) beyond what they close in by."""
 ROUNDS = 20
 """Resting places are pushed apart at most so often: crowded ones may have no answer."""
 
@@ -35,8 +33,7 @@ def stopping_point(
     """The point at which a vehicle that brakes now comes to rest (m): its acceleration fades with
     the time constant `reaction`, and as slowly the braking sets in.
 
-    `acceleration`: at present (m/s^2, world); that of level flight at its tilt, if it
-    isn't known.
+    `acceleration`: at present (m/s^2, world); that of level flight at its tilt, if it isn't known.
     """
     lag = settings.reaction
     present = acceleration or level_acceleration(pose.quaternion)
@@ -167,8 +164,7 @@ def resting_places(
                 place = _push_away(place, (x, y), radius + CLEARANCE)
             for j, other in enumerate(places):
                 if j != i:
-                    # each of the two goes half of the way, from one place in opposite
-                    # directions
+                    # each of the two goes half of the way, from one place in opposite directions
                     place = _push_away(place, other, APART, 0.5, 1.0 if i < j else -1.0)
             # the wall last, so that no push leads out of the arena
             inside = min(1.0, reach / max(math.hypot(*place[:2]), 1e-6))
@@ -180,9 +176,8 @@ def resting_places(
 
 
 def _push_away(place, other, distance, share=1.0, direction=1.0) -> Vector:
-    """The place (x, y, z) moved on its level by a share of what it lacks of a distance
-    from another; out of the very same place along x, forwards or backwards by
-    `direction`.
+    """The place (x, y, z) moved on its level by a share of what it lacks of a distance from
+    another; out of the very same place along x, forwards or backwards by `direction`.
     """
     dx = place[0] - other[0]
     dy = place[1] - other[1]

@@ -44,8 +44,7 @@ class LinksGone(UserError):
 
 
 class Links:
-    """Crazyflies, real or virtual, over links in another process; to the loop what it
-    flies.
+    """Crazyflies, real or virtual, over links in another process; to the loop what it flies.
 
     Args:
       uris, body_logs, watchdog: as of `openjax.flying.swarm.Swarm`.
@@ -95,8 +94,7 @@ class Links:
         """
         context = self._context
         self._contacts = context.RawArray("d", [time.perf_counter()] * len(self._uris))
-        # poses come one after the other; a tick's set-points are one datagram, whole or
-        # not there
+        # poses come one after the other; a tick's set-points are one datagram, whole or not there
         self._stream, stream = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._control, control = context.Pipe()
@@ -132,9 +130,7 @@ class Links:
             self._process = None
 
     def _call(self, name: str, *arguments, timeout: float = 30.0):
-        """The result of a method of the swarm over there. UserError: there is no
-        answer.
-        """
+        """The result of a method of the swarm over there. UserError: there is no answer."""
         try:
             with self._lock:
                 self._calls += 1

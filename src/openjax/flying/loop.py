@@ -1,8 +1,7 @@
-"""The loop: a hundred times a second from poses to set-points, through take-off, games
-and landing.
+"""The loop: a hundred times a second from poses to set-points, through take-off, games and landing.
 
-When a tick is due is `openjax.flying.ticks`', what it asks for `openjax.flying.course`',
-what is noted of it `openjax.flying.flight_record`'s.
+When a tick is due is `openjax.flying.ticks`', what it asks for `openjax.flying.course`', what is
+noted of it `openjax.flying.flight_record`'s.
 """
 
 import gc
@@ -85,8 +84,7 @@ class FlightLoop:
     @property
     def over(self) -> bool:
         """True if all that flew is down, or nothing is going to fly."""
-        # half a second for the first poses to come, before which all stand on the
-        # ground
+        # half a second for the first poses to come, before which all stand on the ground
         if self.state.flying or self.state.time - self.course.since < 0.5:
             return False
         return self.state.all_in(Mode.LANDED, Mode.STOPPED) or any(

@@ -64,8 +64,7 @@ class SwarmMember:
         """A pose block, called by cflib's thread."""
         arrival = perf_counter()
         values = [data[name] for name, _ in POSE_BLOCK]
-        # in millimetres, mm/s, degrees/s and millivolts, so that all fits into one
-        # packet
+        # in millimetres, mm/s, degrees/s and millivolts, so that all fits into one packet
         pose = Pose(
             self._onboard.host(stamp, arrival),
             tuple(1e-3 * v for v in values[:3]),

@@ -32,8 +32,7 @@ def find_feed(name: str) -> Callable:
     """The function MODULE:FUNCTION; modules in the present folder are found too. Raises
     UserError.
     """
-    # a console script's path begins with where it is installed, not with where it is
-    # called
+    # a console script's path begins with where it is installed, not with where it is called
     sys.path.insert(0, str(Path.cwd()))
     try:
         feed = pkgutil.resolve_name(name)
@@ -56,9 +55,7 @@ class MotionCaptured(Links):
         self._arrived = threading.Event()
 
     def feed(self, function: Callable, teller: Teller) -> None:
-        """Let `function(update)` run in a thread of its own; what is believed is
-        told.
-        """
+        """Let `function(update)` run in a thread of its own; what is believed is told."""
         self._teller = teller
         threading.Thread(
             target=function, args=(self.update,), daemon=True, name="motion capture"

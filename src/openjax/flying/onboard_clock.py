@@ -21,14 +21,12 @@ class OnboardClock:
 
     def host(self, stamp: int, arrival: float) -> float:
         """Host seconds of a time stamp that came at `arrival` (s)."""
-        # only a step back by half of the range is a new turn: packets may overtake each
-        # other
+        # only a step back by half of the range is a new turn: packets may overtake each other
         if self._stamp is not None and stamp < self._stamp - _WRAP // 2:
             self._base += _WRAP
         self._stamp = stamp
         on_board = 1e-3 * (stamp + self._base)
-        # the smallest difference so far, let up by as much as clocks may have parted
-        # since
+        # the smallest difference so far, let up by as much as clocks may have parted since
         if math.isfinite(self.offset):
             self.offset += DRIFT * (arrival - self._last)
         self.offset = min(self.offset, arrival - on_board)

@@ -1,8 +1,6 @@
-"""A plan of set-points in a game's place: what `openjax fly --plan` flies with one
-vehicle.
+"""A plan of set-points in a game's place: what `openjax fly --plan` flies with one vehicle.
 
-It answers as `openjax.flying.game.Game` does, so the loop, its safety and its logs are
-the same.
+It answers as `openjax.flying.game.Game` does, so the loop, its safety and its logs are the same.
 """
 
 import math
@@ -28,9 +26,7 @@ YAW_GAIN = 3.0
 nose where it is.
 """
 LIFT_GAIN = 0.05
-"""Share of the hovering thrust by which a height error of 1 m for 1 s changes the
-trim.
-"""
+"""Share of the hovering thrust by which a height error of 1 m for 1 s changes the trim."""
 MOST_TRIM = 0.1
 """Largest trim, as a share of full thrust."""
 FASTEST = 10.0
@@ -91,8 +87,7 @@ class PlannedFlight:
         set_point = accelerate(pose.quaternion, tuple(pull), self.airframe, self._trim, RATES)
         yaw = roll_pitch_yaw(pose.quaternion)[2]
         turn = math.remainder(plan.yaw[row] - yaw, 2.0 * math.pi)
-        # what the plan itself turns until the next row is asked for beside the error's
-        # share
+        # what the plan itself turns until the next row is asked for beside the error's share
         ahead = plan.yaw[min(row + 1, len(plan) - 1)] - plan.yaw[row]
         rates = np.array([set_point.roll, set_point.pitch, YAW_GAIN * turn + ahead / PERIOD])
         thrust = set_point.thrust + plan.extra[row, 0]

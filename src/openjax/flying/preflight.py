@@ -99,8 +99,7 @@ def _firmware_faults(settings, sample, rate) -> Iterator[str]:
 
 def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
     """Reasons by its poses. A pose that can't be one hides all else."""
-    # motion capture says where a vehicle is, where there is one: the own estimate
-    # follows it
+    # motion capture says where a vehicle is, where there is one: the own estimate follows it
     pose = sample.captured or sample.own
     limits = state.limits
     for source in (sample.own, sample.captured):

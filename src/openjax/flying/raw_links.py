@@ -1,6 +1,4 @@
-"""Links without `cflib`'s vehicle around them, for whoever takes over from the links'
-process.
-"""
+"""Links without `cflib`'s vehicle around them, for whoever takes over from the links' process."""
 
 import math
 import struct
@@ -16,8 +14,7 @@ from openjax.flying.swarm import WATCHDOG_PERIOD
 
 
 class RawLinks:
-    """Links without `cflib`'s vehicle around them: packets of the pose block in,
-    set-points out.
+    """Links without `cflib`'s vehicle around them: packets of the pose block in, set-points out.
 
     Args:
       uris: of the vehicles.

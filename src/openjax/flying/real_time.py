@@ -10,9 +10,7 @@ threads (50). The same for loop, links and virtual vehicles: with the loop first
 vehicles last, late poses made the commands older (14.7 ms at p99, not 6 to 8).
 """
 NICE = -10
-"""Of ordinary processes, where the real-time scheduler isn't granted: half of the way
-to first.
-"""
+"""Of ordinary processes, where the real-time scheduler isn't granted: half of the way to first."""
 IN_LINE = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
 """Options of XLA's CPU compiler, see `compile_in_line`."""
 
@@ -20,9 +18,8 @@ IN_LINE = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
 def prepare() -> None:
     """Run JAX in the calling thread.
 
-    JAX hands each call to another thread otherwise, and on a busy machine the way there
-    and back costs milliseconds in one call of a hundred. Call it before anything is
-    computed.
+    JAX hands each call to another thread otherwise, and on a busy machine the way there and back
+    costs milliseconds in one call of a hundred. Call it before anything is computed.
     """
     import jax
 

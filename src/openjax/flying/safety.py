@@ -24,9 +24,7 @@ from openjax.flying.state import FLYING, SPIN_UP, Drone, Event, Mode, Request, S
 from openjax.flying.steering import steer
 
 ASIDE = 0.08
-"""How far (m) a vehicle may move sideways in the test lift: a hover that starts beside
-its trim.
-"""
+"""How far (m) a vehicle may move sideways in the test lift: a hover that starts beside its trim."""
 RISEN = 0.04
 """The test lift is over this close (m) to its height."""
 _DOWN = (Mode.GROUND, Mode.LANDED)
@@ -39,9 +37,7 @@ def step(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
 
 
 def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
-    """The state after a tick whose poses were seen already, and the set-point of each
-    vehicle.
-    """
+    """The state after a tick whose poses were seen already, and the set-point of each vehicle."""
     time = event.time
     actions = event.actions
     finite = actions is not None and all(math.isfinite(x) for action in actions for x in action)
@@ -79,8 +75,7 @@ def _request(state, event) -> tuple[Drone, ...]:
     if answer is not None:
         anchors = resting_places_of(state)
     elif event.request is Request.TRANSFER:
-        # who was in trouble, or landed for some reason, never rises again in this
-        # flight
+        # who was in trouble, or landed for some reason, never rises again in this flight
         able = (*_DOWN, Mode.HOLD, Mode.PURSUIT, Mode.READY)
         if all(d.mode in able and not d.reason and d.estimate is not None for d in drones):
             answer = _transfer

@@ -45,13 +45,9 @@ class SessionSettings:
     body_logs: int = 1
     """Log blocks of motors and accelerometer, 0 to 5: one is what a radio carries."""
     watchdog: bool = True
-    """True if the firmware's watchdog stops the motors once nothing feeds it any
-    more.
-    """
+    """True if the firmware's watchdog stops the motors once nothing feeds it any more."""
     guard: bool = True
-    """True if a process of its own watches, and lands all should loop and links fall
-    silent.
-    """
+    """True if a process of its own watches, and lands all should loop and links fall silent."""
     silence: float = SILENCE
     """Of the loop, after which the links' process lands the vehicles (s)."""
     feed: Callable | None = None
@@ -98,8 +94,7 @@ class Session:
                 self.links.feed(settings.feed, self._recorder.teller)
             self._wait_for_poses()
             blocks = self.links.pose_blocks()
-            # the loop's own, should links and guard both go; over a dongle they open
-            # only then
+            # the loop's own, should links and guard both go; over a dongle they open only then
             self._raw_links = RawLinks(settings.uris, blocks, settings.watchdog)
             if settings.guard:
                 self._guard = Guard(self.links.board, self._raw_links, self._state)
@@ -132,9 +127,7 @@ class Session:
             raise UserError(f"no take-off for these {len(problems)} reasons")
 
     def fly(self, flight: FlightLoop) -> LogOutcome:
-        """Arm and fly; what became of the log, with a complaint where another process
-        landed.
-        """
+        """Arm and fly; what became of the log, with a complaint where another process landed."""
         complaint = ""
         with self.requests:
             self._arm()
@@ -152,9 +145,7 @@ class Session:
         return outcome._replace(complaint=complaint)
 
     def watch(self, moment: float, state: State) -> str:
-        """Tell the others that the loop lives and what it knows; why it must land, if
-        it must.
-        """
+        """Tell the others that the loop lives and what it knows; why it must land, if it must."""
         self.links.board.write(Role.LOOP, moment, state)
         if self._guard is not None and not self._guard.lives():
             return "the guard is gone"
@@ -171,9 +162,7 @@ class Session:
                 raise UserError("a vehicle can't be armed; look at its console")
 
     def _left_to_others(self) -> str:
-        """Return once the vehicles are down; land them here if nobody else does. What
-        happened.
-        """
+        """Return once the vehicles are down; land them here if nobody else does. What happened."""
         board = self.links.board
         lander = Role.LINKS
         if board.pilot is Role.LOOP:
@@ -188,8 +177,7 @@ class Session:
                 board.silent(role, time_read) > board.silence for role in (Role.LINKS, Role.GUARD)
             ):
                 lander = Role.LOOP
-                # should one of them wake up, two would fly, and a dongle serves one
-                # process
+                # should one of them wake up, two would fly, and a dongle serves one process
                 for role in (Role.LINKS, Role.GUARD):
                     board.end_process(role)
                 self._raw_links.open()
@@ -203,9 +191,7 @@ class Session:
             self.links.board.stopped = True
 
     def _wait_for_poses(self):
-        """Return once each vehicle has a pose that is fresh. UserError: one has
-        none.
-        """
+        """Return once each vehicle has a pose that is fresh. UserError: one has none."""
         deadline = time.monotonic() + POSES
         while True:
             time_read = time.perf_counter()

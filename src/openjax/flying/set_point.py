@@ -64,12 +64,11 @@ def as_sent(set_point: SetPoint) -> SetPoint:
 
 
 def from_action(action, thrust_limit: float) -> SetPoint:
-    """The set-point of a policy's action (4,) in -1..1: thrust, roll, pitch and yaw
-    rate up to pi rad/s.
+    """The set-point of a policy's action (4,) in -1..1: thrust, roll, pitch and yaw rate up to pi
+    rad/s.
 
-    The same numbers as `openjax.pursuit.environment.action_to_command`, without a trip
-    to JAX. What is infinite isn't cut to full thrust, but NaN, as whoever sends
-    set-points refuses.
+    The same numbers as `openjax.pursuit.environment.action_to_command`, without a trip to JAX. What
+    is infinite isn't cut to full thrust, but NaN, as whoever sends set-points refuses.
     """
     thrust, roll, pitch, yaw = (
         min(max(float(x), -1.0), 1.0) if math.isfinite(x) else math.nan for x in action

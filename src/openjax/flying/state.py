@@ -17,9 +17,7 @@ from openjax.vehicle.arena import Arena
 SPIN_UP = 0.3
 """A vehicle that lifts off may stand still for so long (s)."""
 FORCE_AGE = 0.025
-"""An accelerometer's sample tells of a pose that was measured no longer (s) before or
-after it.
-"""
+"""An accelerometer's sample tells of a pose that was measured no longer (s) before or after it."""
 _NOTHING_SEEN = Source()
 
 
@@ -50,9 +48,7 @@ class SafetySettings:
     reaction: Annotated[float, Interval("(0, 10]")] = 0.12
     """Time constant with which the acceleration follows what is asked for (s)."""
     pose_timeout: Annotated[float, Interval("(0, 60]")] = 0.06
-    """Without a good pose for longer (s) a vehicle is flown by reckoning no more: it
-    lands.
-    """
+    """Without a good pose for longer (s) a vehicle is flown by reckoning no more: it lands."""
     link_timeout: Annotated[float, Interval("(0, 60]")] = 0.3
     """A link silent for longer (s) is gone."""
     alone_time: Annotated[float, Interval("(0, 1e9]")] = 40.0
@@ -62,13 +58,9 @@ class SafetySettings:
     action_timeout: Annotated[float, Interval("(0, 60]")] = 0.035
     """Without a new action of the policy for longer (s): all stop where they are."""
     battery_low: Annotated[float, Interval("[0, 100]")] = 3.2
-    """Voltage under load at which a vehicle lands (V), if it is as low for
-    `battery_time`.
-    """
+    """Voltage under load at which a vehicle lands (V), if it is as low for `battery_time`."""
     battery_time: Annotated[float, Interval("[0, 60]")] = 0.5
-    """Time for which the voltage must be low (s): a sudden climb takes it down for a
-    moment.
-    """
+    """Time for which the voltage must be low (s): a sudden climb takes it down for a moment."""
     battery_start: Annotated[float, Interval("[0, 100]")] = 3.7
     """No vehicle takes off with less, measured without load (V)."""
     stand: Annotated[float, Interval("(0, 1000]")] = 0.15
@@ -89,9 +81,8 @@ class SafetySettings:
 
     @property
     def landing_time(self) -> float:
-        """A landing that takes longer (s) ends with the motors off: by then a vehicle
-        that began at the highest place that is allowed is near the floor, whatever its
-        pose says.
+        """A landing that takes longer (s) ends with the motors off: by then a vehicle that began at
+        the highest place that is allowed is near the floor, whatever its pose says.
         """
         return (self.arena_height + self.outside) / self.landing_speed
 
@@ -230,9 +221,7 @@ def initial_state(
     airframe: Airframe | None = None,
     settings: SafetySettings | None = None,
 ) -> State:
-    """All vehicles on the ground; they are to start at `starts` (m); pillars are x, y,
-    radius.
-    """
+    """All vehicles on the ground; they are to start at `starts` (m); pillars are x, y, radius."""
     airframe = airframe or nominal_airframe()
     settings = settings or SafetySettings()
     limits = PoseLimits(

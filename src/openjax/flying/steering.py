@@ -28,17 +28,13 @@ the floor be from where it is thought.
 SETTLING_LIFT = 0.85
 """It is then carried by this share of its weight."""
 TRIM_GAIN = 0.25
-"""Share of full thrust by which a climb that is off by 1 m/s for 1 s changes the
-trim.
-"""
+"""Share of full thrust by which a climb that is off by 1 m/s for 1 s changes the trim."""
 TRIM_LIMIT = 0.15
 """Largest trim, as a share of full thrust."""
 
 
 def steer(state: State, i: int, action: SetPoint | None) -> Drone:
-    """Vehicle i after this tick, with its set-point. `action`: the policy's, where
-    there is one.
-    """
+    """Vehicle i after this tick, with its set-point. `action`: the policy's, where there is one."""
     drone = state.drones[i]._replace(sent=MOTORS_OFF)
     time = state.time
     if drone.mode not in FLYING or drone.estimate is None:

@@ -63,8 +63,7 @@ class Swarm:
             ) from error
         for name in ("cflib.crazyflie", "cflib.crazyflie.toccache", "cflib.crazyflie.log"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        # cflib's list of drivers is the process' own: a second call would add them
-        # again
+        # cflib's list of drivers is the process' own: a second call would add them again
         if not cflib.crtp.CLASSES:
             cflib.crtp.init_drivers()
         try:
@@ -144,9 +143,7 @@ class Swarm:
                 break
 
     def _start_in_step(self):
-        """All poses at the same moment, the blocks of motors spread evenly over the 10
-        ms.
-        """
+        """All poses at the same moment, the blocks of motors spread evenly over the 10 ms."""
         begin = perf_counter() + 0.01
         for number in range(1 + self._body_logs):
             due = begin + 1e-3 * PERIOD_MS * (number - 0.5) / self._body_logs if number else begin

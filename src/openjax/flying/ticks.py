@@ -14,9 +14,7 @@ MARGIN = 2.0e-3
 fastest packets tell.
 """
 EARLY = 3.0e-3
-"""A tick begins as soon as all poses are there, up to this much before it is due
-(s).
-"""
+"""A tick begins as soon as all poses are there, up to this much before it is due (s)."""
 PATIENCE = 5.0e-3
 """It begins without them this long after it could have begun (s)."""
 GONE = 0.1
@@ -41,8 +39,7 @@ class TickSchedule:
         ages = sorted((self.due - t) % PERIOD for t in pose_times if time - t < GONE)
         shift = 0.0
         if ages:
-            # poses come in a bunch: the newest of a bunch is the one after the longest
-            # pause
+            # poses come in a bunch: the newest of a bunch is the one after the longest pause
             pauses = [ages[0] + PERIOD - ages[-1]]
             pauses += [older - newer for newer, older in itertools.pairwise(ages)]
             newest = ages[pauses.index(max(pauses))]
@@ -51,8 +48,7 @@ class TickSchedule:
             # slowly, once in step: one late packet mustn't move the ticks
             shift = min(max(0.02 * error, -1e-4), 1e-4) if self._in_step else error
             self._in_step = True
-        # by a late tick the schedule isn't moved: the next one is due when it would
-        # have been
+        # by a late tick the schedule isn't moved: the next one is due when it would have been
         self.due += PERIOD - shift
         while self.due < time - PERIOD:  # that one can't be caught up with any more
             self.due += PERIOD

@@ -134,7 +134,6 @@ def start_parameters(name: str, settings: TrainSettings, parts: Parts) -> Policy
     fresh = abstract_parameters(parts.environment, parts.policy)
     leaves = named_leaves(old.replace(critic={}))
     actor = fill(fresh.replace(critic={}), leaves, f"--start_from {name}")
-    # a critic may see other numbers in another game; it is learnt anew sooner than an
-    # actor
+    # a critic may see other numbers in another game; it is learnt anew sooner than an actor
     fits = jax.tree.map(jnp.shape, old.critic) == jax.tree.map(jnp.shape, fresh.critic)
     return actor.replace(critic=old.critic if fits else {})

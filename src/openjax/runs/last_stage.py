@@ -1,6 +1,4 @@
-"""The stage after MAPPO of a run: its policy may become better by it, and can't become
-worse.
-"""
+"""The stage after MAPPO of a run: its policy may become better by it, and can't become worse."""
 
 import dataclasses
 import time

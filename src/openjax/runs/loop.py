@@ -56,11 +56,10 @@ class Plan:
     will be, and one may have been stopped between a checkpoint and its validation.
     """
     overlap: bool | None = None
-    """Start an update before the last one's metrics are read: an accelerator then never
-    waits for the host.
+    """Start an update before the last one's metrics are read: an accelerator then never waits for
+    the host.
 
-    None: on accelerators. On a CPU nothing is gained, and a NaN stops the run one
-    update sooner.
+    None: on accelerators. On a CPU nothing is gained, and a NaN stops the run one update sooner.
     """
 
 
@@ -127,8 +126,7 @@ class Evaluate(Protocol):
 class Loop:
     """Training until the plan is done, a time limit, a signal or a NaN.
 
-    Several processes run it together: each comes to the same decisions after the same
-    update.
+    Several processes run it together: each comes to the same decisions after the same update.
     """
 
     step: Callable
@@ -231,9 +229,7 @@ class Loop:
         return signals[0] if signals else limit, checkpoint_due
 
     def _save(self, update, carry, validate=False):
-        """Write a checkpoint, with its score on the validation tasks where it is to
-        have one.
-        """
+        """Write a checkpoint, with its score on the validation tasks where it is to have one."""
         score = None
         if validate and self.evaluate is not None:
             if not self.evaluate.is_ready():

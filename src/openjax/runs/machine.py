@@ -13,9 +13,7 @@ _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 
 
 def describe_machine() -> dict:
-    """Device, processor, versions, commit and time, as plain values for a results
-    file.
-    """
+    """Device, processor, versions, commit and time, as plain values for a results file."""
     import jax
 
     devices = jax.devices()
@@ -42,8 +40,7 @@ def commit() -> dict:
     this_file = Path(__file__).resolve()
     source = this_file.parents[1]
     revision = _git(source, "rev-parse", "HEAD")
-    # installed from a wheel, the files may lie inside another repository, whose commit
-    # says nothing
+    # installed from a wheel, the files may lie inside another repository, whose commit says nothing
     if revision is None or _git(source, "ls-files", "--error-unmatch", str(this_file)) is None:
         return {"commit": None, "commit_clean": None}
     changes = _git(source, "status", "--porcelain", "--", str(source))

@@ -44,8 +44,7 @@ class OtherPolicy:
     def fly(
         self, scenarios: Sequence[Scenario], episodes: int, validation: int
     ) -> tuple[list[dict], list[Trajectory]]:
-        """Fly `validation` of the run's uniform validation tasks, and `episodes` of each
-        layout.
+        """Fly `validation` of the run's uniform validation tasks, and `episodes` of each layout.
 
         Returns:
           records as of `Flown.record`, that of the validation tasks first, their capture
@@ -66,9 +65,7 @@ class OtherPolicy:
 
 
 def other_policy(name: str, environment: Pursuit) -> OtherPolicy:
-    """The policy of that name in the game of a run. Raises UserError where it can't play
-    it.
-    """
+    """The policy of that name in the game of a run. Raises UserError where it can't play it."""
     policy = load_policy(name)
     game = game_for(environment, policy)
     return OtherPolicy(policy.in_game(game), game, environment.settings)

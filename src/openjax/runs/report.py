@@ -66,9 +66,7 @@ def report(
 
 
 def _compare(job, layouts, validation, progress):
-    """Records and flights of the policy beside which the run's is shown; none without
-    one.
-    """
+    """Records and flights of the policy beside which the run's is shown; none without one."""
     if job.other is None:
         return [], []
     progress.phase(f"evaluating {job.command.compare_with} in the same game")
@@ -77,9 +75,8 @@ def _compare(job, layouts, validation, progress):
 
 
 def _fly(validation, parameters, layouts, episodes):
-    """Validation tasks and layouts, flown by a policy; and what to draw of them: (kind,
-    episode, title), a flight of each layout, or some validation tasks where no layout
-    fits the game.
+    """Validation tasks and layouts, flown by a policy; and what to draw of them: (kind, episode,
+    title), a flight of each layout, or some validation tasks where no layout fits the game.
     """
     kinds_flown = validation(parameters)
     if not layouts:

@@ -27,9 +27,7 @@ from openjax.store.policy_files import fill, save_policy_file
 from openjax.store.run_directory import RunDirectory
 
 EARLY = 10.0
-"""Taken from the score of a checkpoint before `validation_start`: no policy's score is
-as low.
-"""
+"""Taken from the score of a checkpoint before `validation_start`: no policy's score is as low."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,8 +196,7 @@ class CheckpointScore:
             return processes.of_first()
         with self.run.stop.while_compiling():
             validation = self.run.programs.validation()
-        # a copy: on several devices the carry's leaves lie elsewhere than the
-        # validation's
+        # a copy: on several devices the carry's leaves lie elsewhere than the validation's
         uniform, far_tasks = (
             summarise(kind.evaluation) for kind in validation(own_copy(carry.policy))
         )

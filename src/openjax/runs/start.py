@@ -70,17 +70,15 @@ def read_command(arguments: Sequence[str]) -> TrainCommand:
 
 
 def membership(arguments: Sequence[str]) -> Membership | None:
-    """The place among several processes that the command line or the job's manager
-    gives to this one.
+    """The place among several processes that the command line or the job's manager gives to this
+    one.
 
-    It's needed before the command line can be read in full, as a preset depends on the
-    devices.
+    It's needed before the command line can be read in full, as a preset depends on the devices.
     """
     if {"-h", "--help"} & set(arguments):
         return None
 
-    # not by tyro, which isn't asked before the devices are known; nine digits hold any
-    # job's number
+    # not by tyro, which isn't asked before the devices are known; nine digits hold any job's number
     def number(name):
         text = peek(arguments, name)
         if text is not None and not (text.isdecimal() and len(text) <= 9):

@@ -19,9 +19,8 @@ MAY_CHANGE = ("total_steps", "validation_interval", "validation_episodes")
 class TrainCommand:
     """Train pursuers to capture a faster evader.
 
-    Every setting of the run can be given, such as --mappo.minibatches 8. The defaults shown
-    are those of the preset quick, or of the one given: openjax train --preset paper
-    --help.
+    Every setting of the run can be given, such as --mappo.minibatches 8. The defaults shown are
+    those of the preset quick, or of the one given: openjax train --preset paper --help.
     """
 
     preset: str | None = None
@@ -40,9 +39,7 @@ class TrainCommand:
     steps: Annotated[int | None, Interval("[1, 1e15]")] = None
     """Environment steps of the whole run, short for --total_steps."""
     minutes: Annotated[float | None, Interval("(0, 1000000]")] = None
-    """Learn for so long: compiling comes before it, the report after. A resumed run has
-    it anew.
-    """
+    """Learn for so long: compiling comes before it, the report after. A resumed run has it anew."""
     resume: Path | None = None
     """Go on with the run in this directory, exactly where it stopped."""
     start_from: str | None = None
@@ -58,9 +55,8 @@ class TrainCommand:
     writes it; by default the settings' airframe.
     """
     opponent: str | None = None
-    """Evader to train against: field, greedy, wall_runner and others (openjax evaluate
-    --help), or a file that openjax exploit wrote, or FILE.py:function; short for
-    --environment.evaders.
+    """Evader to train against: field, greedy, wall_runner and others (openjax evaluate --help), or
+    a file that openjax exploit wrote, or FILE.py:function; short for --environment.evaders.
     """
     devices: str | None = None
     """Number of devices to train on, or all (of all processes); by default one

@@ -41,9 +41,8 @@ __all__ = [
 
 HIDDEN = (".", "~$")
 
-# The last that is registered is the first that is asked: a CSV that no other one knows
-# is taken for one of the log format, and a layout with several time stamps may hold a
-# firmware's names.
+# The last that is registered is the first that is asked: a CSV that no other one knows is taken for
+# one of the log format, and a layout with several time stamps may hold a firmware's names.
 for _importer in (
     log_format.IMPORTER,
     crazyflie.IMPORTER,

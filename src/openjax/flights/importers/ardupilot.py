@@ -1,10 +1,9 @@
 """ArduPilot's DataFlash logs (`.bin`), through the `pymavlink` library.
 
-ArduPilot's world is north, east, down and its body forward, right, down; here they are east,
-north, up and forward, left, up. Motors are those of a quad X, on the outputs that
-SERVOi_FUNCTION names; a pulse between MOT_PWM_MIN and MOT_PWM_MAX is turned into thrust by
-ArduPilot's own curve, thrust = e s^2 + (1 - e) s with e = MOT_THST_EXPO
-(AP_Motors_Thrust_Linearization.cpp).
+ArduPilot's world is north, east, down and its body forward, right, down; here they are east, north,
+up and forward, left, up. Motors are those of a quad X, on the outputs that SERVOi_FUNCTION names; a
+pulse between MOT_PWM_MIN and MOT_PWM_MAX is turned into thrust by ArduPilot's own curve, thrust = e
+s^2 + (1 - e) s with e = MOT_THST_EXPO (AP_Motors_Thrust_Linearization.cpp).
 """
 
 import contextlib

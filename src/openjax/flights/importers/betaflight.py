@@ -33,8 +33,7 @@ from openjax.flights.reading import CHANNEL_COLUMNS, LogError, LogTable
 MAGIC = b"H Product:Blackbox"
 DSHOT = (48.0, 2047.0)  # the least and the largest throttle value of the protocol
 PULSE = (1000.0, 2000.0)  # us
-# {nominal place's column: index of Betaflight's motor}, mixerQuadX in
-# flight/mixer_init.c
+# {nominal place's column: index of Betaflight's motor}, mixerQuadX in flight/mixer_init.c
 MOTOR_OF = {"m1": 1, "m2": 0, "m3": 2, "m4": 3}
 FIRST = "loopIteration"  # the name of the first column
 HEADERS_FILE = ".headers.csv"
@@ -256,9 +255,7 @@ def _number(headers: dict[str, str], name: str) -> float:
 
 
 def _scale(name: str, usual: float) -> float:
-    """The factor of a field to the log format's unit: that in its brackets, or the
-    usual one.
-    """
+    """The factor of a field to the log format's unit: that in its brackets, or the usual one."""
     unit = _FIELD.fullmatch(name)[2]
     return usual if unit is None else UNITS.get(_UNIT_NAMES.get(unit, unit), usual)
 

@@ -1,8 +1,7 @@
-"""The mapping of columns: which column, log variable or message field holds what, in which
-unit.
+"""The mapping of columns: which column, log variable or message field holds what, in which unit.
 
-A `columns.toml` in a case folder applies to all its logs. A CSV column that it doesn't
-name and that has a name of the log format is taken as it is:
+A `columns.toml` in a case folder applies to all its logs. A CSV column that it doesn't name and
+that has a name of the log format is taken as it is:
 
     delimiter = ";"  # CSV only; by its header if left out
 
@@ -13,16 +12,16 @@ name and that has a name of the log format is taken as it is:
     ax = { from = "/cf1/imu:linear_acceleration.x" }  # a field of a ROS 2 topic
     cmd_wy = { from = "pitch_rate", unit = "deg/s", scale = -1 }
 
-A CSV whose topics have time stamps of their own names each, and what is `of` it; where
-names begin as the stamp's does ("imu.time", "imu.wx"), that may be left out:
+A CSV whose topics have time stamps of their own names each, and what is `of` it; where names begin
+as the stamp's does ("imu.time", "imu.wx"), that may be left out:
 
     t = [
         { from = "pose.time", unit = "ns" },
         { from = "stamp_2", unit = "ns", of = ["wx", "wy", "wz"] },
     ]
 
-Besides the columns of the log format, `roll`, `pitch`, `yaw` (z-y-x, body to world) may
-stand for the quaternion.
+Besides the columns of the log format, `roll`, `pitch`, `yaw` (z-y-x, body to world) may stand for
+the quaternion.
 """
 
 import math
@@ -70,9 +69,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Clock:
-    """A time stamp of some columns: its source, and the columns that are said to be of
-    it.
-    """
+    """A time stamp of some columns: its source, and the columns that are said to be of it."""
 
     source: Source
     columns: tuple[str, ...] = ()
@@ -112,8 +109,7 @@ class ColumnMapping:
     def table(self, name: str, raw: LogTable) -> LogTable:
         """A raw CSV table with its columns renamed and converted; time starts at zero.
 
-        Columns under the log format's own names are inherited. Raises LogError without
-        time.
+        Columns under the log format's own names are inherited. Raises LogError without time.
         """
         sources = {source.name for source in self.columns.values()}
         named_columns = {
@@ -223,9 +219,7 @@ def load_mapping(path: str | Path) -> ColumnMapping:
 
 
 def source_of(column: str, entry, path: Path) -> Source:
-    """An entry of a `columns.toml`. Raises UserError for an unknown key, column or
-    unit.
-    """
+    """An entry of a `columns.toml`. Raises UserError for an unknown key, column or unit."""
     possible = (*LOG_COLUMNS, *EULER)
     if column not in possible:
         raise UserError(
@@ -252,9 +246,7 @@ def source_of(column: str, entry, path: Path) -> Source:
 
 
 def _clock(entry, path: Path) -> Clock:
-    """One of several time stamps. Raises UserError for an unknown column, key or
-    unit.
-    """
+    """One of several time stamps. Raises UserError for an unknown column, key or unit."""
     columns = entry.get("of", []) if isinstance(entry, dict) else []
     possible = (*LOG_COLUMNS[2:], *EULER)
     unknown = (

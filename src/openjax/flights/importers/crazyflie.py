@@ -1,10 +1,9 @@
-"""CSV files with the firmware's names: what the Crazyflie's client writes of a log
-block, and what scripts with cflib write.
+"""CSV files with the firmware's names: what the Crazyflie's client writes of a log block, and what
+scripts with cflib write.
 
-The client's `LogWriter` puts the firmware's tick in ms into a column `Timestamp` and
-one file per log block; scripts call it `timestamp` or `tick`. Files of several blocks
-of one flight, which have the same ticks, may lie in one folder of the case: they are
-one log.
+The client's `LogWriter` puts the firmware's tick in ms into a column `Timestamp` and one file per
+log block; scripts call it `timestamp` or `tick`. Files of several blocks of one flight, which have
+the same ticks, may lie in one folder of the case: they are one log.
 """
 
 from pathlib import Path
@@ -32,9 +31,7 @@ from openjax.flights.reading import LogError, LogTable
 
 TIME_NAMES = ("timestamp", "tick", "ticks", "time", "time_ms", "timestamp_ms", "t")
 GROUPS = ("stateEstimate", "stateEstimateZ", "stabilizer", "kalman", "gyro", "acc", "controller")
-"""Of log variables whose names no other program has; other programs have a `motor.m1`,
-too.
-"""
+"""Of log variables whose names no other program has; other programs have a `motor.m1`, too."""
 SINCE_1970 = 1e9  # s, from which stamps count since then
 SELDOM = 2000.0  # ms between rows: the slowest log block of the firmware has 2550
 
@@ -71,9 +68,7 @@ def time_name(names: list[str]) -> str | None:
 
 
 def read_client_log(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
-    """A flight's log blocks. Raises LogError where they hold nothing that can be
-    used.
-    """
+    """A flight's log blocks. Raises LogError where they hold nothing that can be used."""
     files = _blocks(path) if path.is_dir() else [path]
     streams = []
     remarks = []
@@ -114,9 +109,8 @@ def _block(path: Path, mapping: ColumnMapping | None) -> tuple[Stream, list[str]
 
 
 def _tick(ticks: np.ndarray) -> float:
-    """Seconds of a tick: a ms in the firmware, so that a block that is logged once a
-    second has steps of 1000; where rows are further apart, or not whole numbers, what
-    the steps look like.
+    """Seconds of a tick: a ms in the firmware, so that a block that is logged once a second has
+    steps of 1000; where rows are further apart, or not whole numbers, what the steps look like.
     """
     steps = np.diff(np.unique(ticks[np.isfinite(ticks)]))
     is_whole = len(steps) and not (steps % 1.0).any()

@@ -62,9 +62,7 @@ def custom_topics(bag: Path) -> list[dict]:
 
 
 def variables_of(topic: str, files: list[dict]) -> tuple[str, ...] | None:
-    """The log variables of a topic ("/cf1/state"), in their order; None where no file
-    names it.
-    """
+    """The log variables of a topic ("/cf1/state"), in their order; None where no file names it."""
     vehicle, _, name = topic.strip("/").rpartition("/")
     for tables in files:
         robot = _table(tables, "robots", vehicle)

@@ -1,7 +1,6 @@
 """The list of importers. Each recognises its own files and reads them as a `LogTable`.
 
-The shipped ones are in a list like any other; a program of yours adds one by
-`register`.
+The shipped ones are in a list like any other; a program of yours adds one by `register`.
 """
 
 from collections.abc import Callable
@@ -23,9 +22,8 @@ class Importer:
     name: str
     """Of the format, in words."""
     matches: Callable[[Path], bool]
-    """matches(path): whether a file or folder of a case is such a log. It is asked of
-    everything in the folder, so it looks at the name or at the first bytes, and never
-    raises.
+    """matches(path): whether a file or folder of a case is such a log. It is asked of everything in
+    the folder, so it looks at the name or at the first bytes, and never raises.
     """
     read: Callable[[Path, ColumnMapping | None], LogTable]
     """read(path, mapping): the log in the log format's columns and units. `mapping` is

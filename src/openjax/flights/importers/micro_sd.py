@@ -82,8 +82,7 @@ def decode(data: bytes) -> tuple[list[Stream], list[str]]:
     remarks = []
     end = len(data) - 4
     if crc32(data[:end]) != int.from_bytes(data[end:], "little"):
-        # Power was cut before the file was closed: what was written is there, its
-        # checksum isn't.
+        # Power was cut before the file was closed: what was written is there, its checksum isn't.
         remarks.append(
             "the checksum doesn't match: the log is cut off or corrupt, read as far as it goes"
         )

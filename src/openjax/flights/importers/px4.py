@@ -1,14 +1,12 @@
 """PX4's ULog files (`.ulg`), through the `pyulog` library.
 
-PX4's world is north, east, down and its body forward, right, down; here they are east,
-north, up and forward, left, up. Motors are put into the nominal order by the places
-that the log's parameters give them (CA_ROTORi_PX, _PY, metres forward and right), or by
-PX4's quad X.
+PX4's world is north, east, down and its body forward, right, down; here they are east, north, up
+and forward, left, up. Motors are put into the nominal order by the places that the log's parameters
+give them (CA_ROTORi_PX, _PY, metres forward and right), or by PX4's quad X.
 
-`actuator_motors` holds shares of the largest thrust. Where it wasn't logged,
-`actuator_outputs` is taken between its least and largest value, and turned into thrust
-by PX4's own curve, thrust = f s^2 + (1 - f) s with f = THR_MDL_FAC
-(FunctionMotors.hpp).
+`actuator_motors` holds shares of the largest thrust. Where it wasn't logged, `actuator_outputs` is
+taken between its least and largest value, and turned into thrust by PX4's own curve, thrust = f s^2
++ (1 - f) s with f = THR_MDL_FAC (FunctionMotors.hpp).
 """
 
 import contextlib
@@ -31,8 +29,7 @@ PULSE = (1000.0, 2000.0)  # us, PX4's defaults of PWM_MIN and PWM_MAX
 SELDOM = 3  # values outside of its range that an output may have
 MOTOR_1 = 101  # the output function of motor 1 in PWM_MAIN_FUNCi
 
-# Topics and, in the frames of the log format, the columns that they hold: (field,
-# scale).
+# Topics and, in the frames of the log format, the columns that they hold: (field, scale).
 TOPICS: dict[str, dict[str, tuple[str, float]]] = {
     "vehicle_local_position": {
         "x": ("y", 1.0),
@@ -80,11 +77,10 @@ def is_ulog(path: Path) -> bool:
 
 
 def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
-    """Read a ULog. With a mapping, sources are "TOPIC:FIELD" in PX4's frames and units;
-    what it doesn't name is recognised.
+    """Read a ULog. With a mapping, sources are "TOPIC:FIELD" in PX4's frames and units; what it
+    doesn't name is recognised.
 
-    Raises LogError if it is damaged or holds nothing known, UserError without the
-    library.
+    Raises LogError if it is damaged or holds nothing known, UserError without the library.
     """
     mapping_columns = {} if mapping is None else mapping.over({})
     log = _parse(path, {source.name.partition(":")[0] for source in mapping_columns.values()})
@@ -117,9 +113,7 @@ def read_ulog(path: Path, mapping: ColumnMapping | None = None) -> LogTable:
 
 
 def _parse(path: Path, more: set[str]):
-    """The library's log of the topics that are known and `more`. Raises as `read_ulog`
-    does.
-    """
+    """The library's log of the topics that are known and `more`. Raises as `read_ulog` does."""
     try:
         from pyulog import ULog
     except ImportError as error:
@@ -164,9 +158,8 @@ def _period(stream: Stream) -> float:
 
 
 def _turn(stream: Stream) -> Stream:
-    """The attitude's stream with the quaternion of the log format, body (forward, left,
-    up) to world (east, north, up): q' = (i + j)/sqrt(2) q i*, of q from body to world
-    in PX4's frames.
+    """The attitude's stream with the quaternion of the log format, body (forward, left, up) to
+    world (east, north, up): q' = (i + j)/sqrt(2) q i*, of q from body to world in PX4's frames.
     """
     w, x, y, z = (stream.values[f"{ATTITUDE}:q[{i}]"] for i in range(4))
     half = np.sqrt(0.5)

@@ -46,10 +46,9 @@ _FORCE = {f"a{a}": f"linear_acceleration.{a}" for a in "xyz"}
 # By suffix how a bag's file begins.
 STORAGE = {".mcap": b"\x89MCAP0", ".db3": b"SQLite format 3", ".bag": b"#ROSBAG V2.0"}
 ODOMETRY = "nav_msgs/msg/Odometry"
-# Fields of the message types that say what they hold: column -> field. An odometry's
-# twist is left out: it is in the body frame, and velocity can be derived from position.
-# Its pose goes behind others: Crazyswarm2's with cflib has the firmware's legacy sign
-# of pitch.
+# Fields of the message types that say what they hold: column -> field. An odometry's twist is left
+# out: it is in the body frame, and velocity can be derived from position. Its pose goes behind
+# others: Crazyswarm2's with cflib has the firmware's legacy sign of pitch.
 KNOWN_TYPES = {
     "sensor_msgs/msg/Imu": _RATES | _FORCE,
     "geometry_msgs/msg/PoseStamped": _pose("pose.position", "pose.orientation"),
@@ -150,9 +149,7 @@ class _Recording:
     ahead: list[float] = field(default_factory=list)
 
     def add(self, stream: Stream, columns: dict[str, Source], rank: int = 0) -> None:
-        """One more topic. What a topic of a lower `rank`, or a faster one, holds goes
-        before.
-        """
+        """One more topic. What a topic of a lower `rank`, or a faster one, holds goes before."""
         self.streams.append(stream)
         self.sources.append((rank, columns))
 
@@ -163,8 +160,7 @@ class _Recording:
         by_name, remarks = firmware_columns(self.log_streams)
         both = zip(self.sources, self.streams, strict=True)
         topics = [(rank, _period(stream), columns) for (rank, columns), stream in both]
-        # what comes later replaces what came before: the fastest of the lowest rank
-        # goes last
+        # what comes later replaces what came before: the fastest of the lowest rank goes last
         topics.sort(key=lambda topic: topic[:2], reverse=True)
         columns = {c: source for *_, of_stream in topics for c, source in of_stream.items()}
         poses = [topic for topic in topics if "x" in topic[2]]
@@ -188,9 +184,7 @@ class _Recording:
 def _vehicles(
     reader, mapping: ColumnMapping | None, path: Path
 ) -> tuple[dict[str, _Recording], list[str]]:
-    """{vehicle: what the bag holds of it}, and remarks. With a mapping all is one
-    vehicle's.
-    """
+    """{vehicle: what the bag holds of it}, and remarks. With a mapping all is one vehicle's."""
     topics = _wanted_columns(reader.connections, mapping)
     files = custom_topics(path) if mapping is None else []
     vehicles: dict[str, _Recording] = {}
@@ -307,9 +301,8 @@ def _period(stream: Stream) -> float:
 
 
 def _messages(reader, connection):
-    """(stamp, message) of a topic: integer nanoseconds since the bag's start, which
-    keep their resolution as floats of seconds; the header's where there is one, else
-    when it was received.
+    """(stamp, message) of a topic: integer nanoseconds since the bag's start, which keep their
+    resolution as floats of seconds; the header's where there is one, else when it was received.
     """
     for _, arrival, data in reader.messages(connections=[connection]):
         message = reader.deserialize(data, connection.msgtype)

@@ -44,13 +44,12 @@ class Stream:
 def merge_streams(
     streams: list[Stream], columns: dict[str, Source]
 ) -> dict[str, Shaped[np.ndarray, " rows"]]:
-    """Columns of the log format on one clock: that of the fastest stream with motion in
-    it (`t` as in the stream).
+    """Columns of the log format on one clock: that of the fastest stream with motion in it (`t` as
+    in the stream).
 
-    Other motion streams are interpolated linearly, commands are held, the battery keeps
-    its own samples. What is older than five periods of its stream counts as not
-    sampled. Raises LogError if no motion is there, if a stream holds several
-    recordings, or if it ends before the others begin.
+    Other motion streams are interpolated linearly, commands are held, the battery keeps its own
+    samples. What is older than five periods of its stream counts as not sampled. Raises LogError if
+    no motion is there, if a stream holds several recordings, or if it ends before the others begin.
     """
     series = []
     for stream in streams:
@@ -63,8 +62,7 @@ def merge_streams(
             "holds neither position and orientation nor a gyroscope under known names: name what "
             "it has in columns.toml"
         )
-    # to a microsecond: of streams at one rate the first is the clock, however stamps
-    # are rounded
+    # to a microsecond: of streams at one rate the first is the clock, however stamps are rounded
     clock = min(with_motion, key=lambda u: round(float(np.median(np.diff(u[0]))), 6))[0]
     # a message that came twice is one row
     clock = clock[np.r_[True, np.diff(clock) > 0]]

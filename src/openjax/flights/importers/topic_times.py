@@ -1,11 +1,9 @@
-"""CSV files with a time stamp for each topic, as exports from bags have them:
-`pose.time, pose.x, ..., imu.time, imu.wx, ...`. What stands in a row together needn't
-have been measured together, so that each topic is a stream with its own clock, merged
-as a bag's topics are.
+"""CSV files with a time stamp for each topic, as exports from bags have them: `pose.time, pose.x,
+..., imu.time, imu.wx, ...`. What stands in a row together needn't have been measured together, so
+that each topic is a stream with its own clock, merged as a bag's topics are.
 
-The layout is evident where two or more columns are called like a topic and a time.
-Without a `columns.toml` the last part of a name says what it holds: `imu.wx` is `wx`,
-`quat.w` is `qw`.
+The layout is evident where two or more columns are called like a topic and a time. Without a
+`columns.toml` the last part of a name says what it holds: `imu.wx` is `wx`, `quat.w` is `qw`.
 """
 
 import re
@@ -151,9 +149,8 @@ def _named_stamps(names: list[str], mapping: ColumnMapping | None) -> dict[str, 
 
 
 def _clocks(sources, stamps: dict[str, str], mapping: ColumnMapping | None) -> dict[str, str]:
-    """{column: the time stamp's column} of what is read: what `columns.toml` says, its
-    topic's, or else the first that it names. Raises LogError for a column that has
-    none.
+    """{column: the time stamp's column} of what is read: what `columns.toml` says, its topic's, or
+    else the first that it names. Raises LogError for a column that has none.
     """
     named_sources = {}
     usual = None
@@ -177,8 +174,7 @@ def _streams(raw, sources, clock_of: dict[str, str], mapping) -> tuple[list[Stre
     units = {} if mapping is None else {c.source.name: c.source.scale for c in mapping.clocks}
     usual = None if mapping is None or "t" not in mapping.columns else mapping.columns["t"].scale
     scale = {c: units.get(c, usual or seconds_per_unit(raw[c])) for c in clocks}
-    # Stamps since 1970 in ns are known to 256 ns as floats; their differences lose no
-    # more.
+    # Stamps since 1970 in ns are known to 256 ns as floats; their differences lose no more.
     begin = {
         unit: min(np.nanmin(raw[c]) for c in clocks if scale[c] == unit) for unit in scale.values()
     }
