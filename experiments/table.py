@@ -13,7 +13,7 @@ stored.
 
     publish(page_parser(__doc__, "vehicles").parse_args(arguments), study, page)
 
-`--report` prints every table of what is stored. A page of results has one of them, between two
+`--report` prints the tables of what is stored. A page of results has one of them, between two
 marks, in words that somebody wrote: those stay, and the table between the marks is made anew.
 """
 

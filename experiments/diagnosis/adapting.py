@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.diagnosis.closed_loop import described, fly_segments
 from experiments.diagnosis.generate import in_processes
 from experiments.flying.single_thread import use_single_thread
 
@@ -61,24 +62,11 @@ class Flown:
     def case(self):
         """Its flights, as a case for the diagnosis."""
         from openjax.flights import flight
-        from openjax.flights.reading import flights_of
-        from openjax.flights.samples import Turbulence, fly, log_of
-        from openjax.flights.segments import SEGMENTS as ALL
-        from openjax.gap.planning.information import SECONDS
-        from openjax.vehicle.vehicle_file import load_vehicle_file
 
-        told = replace(
-            load_vehicle_file(), mass_weighed=self.cause != "mass", log={"motor_rows": "mean"}
-        )
-        found = []
-        for place, name in enumerate(SEGMENTS):
-            seed = 1000 * SEED + 100 * self.number + place
-            reference = ALL[name].reference(SECONDS)
-            columns = fly(
-                told.vehicle, told.vehicle, reference, seed, self.effects(), air=Turbulence()
-            )
-            found += flights_of(log_of(columns, name), (0, 1, 2, 3))[0]
-        return flight.Case(self.cause, tuple(found), told)
+        told = replace(described(), mass_weighed=self.cause != "mass")
+        names = {name: name for name in SEGMENTS}
+        flights = fly_segments(told, names, 1000 * SEED + 100 * self.number, self.effects())
+        return flight.Case(self.cause, tuple(flights), told)
 
 
 def diagnosed(job: tuple[int, Path]) -> dict:

@@ -142,21 +142,7 @@ def figures_of(records: list[dict]) -> Table:
 
 
 def page(results: dict) -> Page:
-    """Figures, then every comparison."""
-    columns = {
-        "vehicle": "vehicle",
-        "condition": "condition",
-        "P(changed)": "probability:.2f",
-        "changed": "changed",
-        "said": lambda r: ", ".join(r["said"]) or None,
-        "rotors": lambda r: "+".join(f"m{i}" for i in r["rotors"]) or None,
-        "size, % [90 %]": lambda r: (
-            "{:.0f} [{:.0f}, {:.0f}]".format(*(100 * v for v in r["size90"]))
-            if "size90" in r
-            else None
-        ),
-        "least that shows, %": lambda r: f"{100 * r['least']:.0f}" if "least" in r else None,
-    }
+    """The figures."""
     prose = (
         "Two sets of flights of one vehicle are compared; what was changed is known. The real "
         "flights are open: they were in "
@@ -164,8 +150,7 @@ def page(results: dict) -> Page:
         "rotor's thrust, or of what "
         "changed."
     )
-    records = results["records"]
-    return Page("What changed", prose, [figures_of(records), Table(columns, records)])
+    return Page("What changed", prose, figures_of(results["records"]))
 
 
 def figure(folder: Path) -> None:

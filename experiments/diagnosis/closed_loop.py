@@ -39,26 +39,33 @@ class Case:
 
     def fly(self, segments, round_number: int) -> list:
         """Flights of segments in a round."""
-        from openjax.flights.reading import flights_of
-        from openjax.flights.samples import Turbulence, fly, log_of
-        from openjax.flights.segments import SEGMENTS
-        from openjax.gap.planning.information import SECONDS
         from openjax.vehicle.effects import EFFECTS
 
         effects = {self.cause: EFFECTS[self.cause].card.sample}
-        vehicle = described().vehicle
-        found = []
-        for place, name in enumerate(segments):
-            reference = SEGMENTS[name].reference(SECONDS)
-            seed = 1000 * self.number + 100 * round_number + place
-            columns = fly(vehicle, vehicle, reference, seed, effects, air=Turbulence())
-            log = log_of(columns, f"{round_number}_{place}_{name}")
-            found += flights_of(log, (0, 1, 2, 3))[0]
-        return found
+        names = {f"{round_number}_{place}_{name}": name for place, name in enumerate(segments)}
+        return fly_segments(described(), names, 1000 * self.number + 100 * round_number, effects)
 
     def hovers(self) -> list:
         """The flights that say little, with which every study begins."""
         return self.fly(("hover", "hover"), 0)
+
+
+def fly_segments(told, names: dict[str, str], seed: int, effects: dict) -> list:
+    """Flights of a vehicle with effects in uneven air: segments by the names of their logs, the
+    first of them seeded by `seed`.
+    """
+    from openjax.flights.reading import flights_of
+    from openjax.flights.samples import Turbulence, fly, log_of
+    from openjax.flights.segments import SEGMENTS
+    from openjax.gap.planning.information import SECONDS
+
+    vehicle = told.vehicle
+    found = []
+    for place, (log, name) in enumerate(names.items()):
+        reference = SEGMENTS[name].reference(SECONDS)
+        columns = fly(vehicle, vehicle, reference, seed + place, effects, air=Turbulence())
+        found += flights_of(log_of(columns, log), (0, 1, 2, 3))[0]
+    return found
 
 
 def described():

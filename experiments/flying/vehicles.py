@@ -124,13 +124,7 @@ def study(options) -> dict:
 
 
 def page(results: dict) -> Page:
-    """A row per policy, kind of vehicle and kind of task."""
-    rows = [
-        {"policy": name, "vehicle": kind, "tasks": tasks, **summary}
-        for name, kinds in results["policies"].items()
-        for kind, records in kinds.items()
-        for tasks, summary in records.items()
-    ]
+    """A row per policy."""
     return Page(
         "Policies on other vehicles",
         f"No clamp, rate loop at 500 Hz, drawn starts, contacts of `rigid`; {results['number']} "
@@ -139,7 +133,6 @@ def page(results: dict) -> Page:
         "motors 40 ms slower, commands 15 ms "
         "and poses 10 ms late, drag of .0125 N s/m; family: the vehicles of the preset flight, "
         "half of them rare ones. " + results.get("note", ""),
-        Table({"policy": "policy", "vehicle": "vehicle", "tasks": "tasks", **FIGURES}, rows),
         over_layouts(results),
     )
 

@@ -23,7 +23,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from experiments.table import Page, Table, page_parser, publish, spread
+from experiments.table import Page, Table, page_parser, publish
 from openjax.evaluation.validation import uniform_tasks
 from openjax.files import read_json
 from openjax.learning.presets import PRESETS
@@ -31,30 +31,20 @@ from openjax.pursuit import SCENARIOS, Pursuit
 from openjax.store.policies import LoadedPolicy, load_policy
 
 CORES = 2
-TRIED_ON = ("rows .30", "rows .35", "rows .33 to .40", "gates", "cluster", "six pillars", "crashes")
-"""What variants of the first flights were flown on; spacings in metres."""
 
 
 def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
     """One run on those cores: what its table says, and the seconds of the whole command."""
     run = options.runs / f"seed_{seed}"
     command = [sys.executable, "-m", "openjax.train", "--preset", "quick", "--seed", str(seed)]
-    command += [
-        "--out",
-        str(run),
-        "--overwrite",
-        "--no-compilation_cache",
-        *options.options.split(),
-    ]
+    command += ["--out", str(run), "--overwrite", "--no-compilation_cache"]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    for name in (
-        "JAX_COMPILATION_CACHE_DIR",
-        "TF_CPP_MIN_LOG_LEVEL",
-    ):  # JAX sets the latter here, a user doesn't
+    # JAX sets the latter here, a user doesn't
+    for name in ("JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL"):
         environment.pop(name, None)
     start = time.monotonic()
     with open(f"{run}.txt", "w") as log:
-        pinned = ["taskset", "-c", ",".join(map(str, cores)), *command]
+        pinned = ["taskset", "-c", ",".join(map(str, cores)), *command, *options.options.split()]
         subprocess.run(pinned, env=environment, stdout=log, stderr=subprocess.STDOUT, check=True)
     seconds = round(time.monotonic() - start)
     print(f"seed {seed}: {seconds} s", flush=True)
@@ -124,30 +114,10 @@ def study(options: argparse.Namespace) -> dict:
 
 
 def page(results: dict) -> Page:
-    """A row per seed."""
-    columns = {
-        "seed": "seed",
-        "recipe": lambda run: run.get("recipe", "today's"),
-        "JAX": "jax",
-        "whole command, s": "whole_command",
-        "new tasks": _column("after", "validation"),
-        "... looked at every 10 ms": lambda run: _three(run.get("every_physics_step"), 1.0),
-        "far starts": _column("after", "validation_far"),
-        **{f"`{name}`": _column("after", name) for name in SCENARIOS},
-        "new tasks, `open`": _column("open", "validation"),
-    }
-    parts: list[Table | str] = [Table(columns, results["runs"])]
-    if "trials" in results:
-        runs = {name: (lambda row, name=name: spread(row[name], ".2f")) for name in TRIED_ON}
-        parts.append(
-            Table({"variant": "variant", "updates": "updates", **runs}, *results["trials"])
-        )
-    parts.append("\n".join(f"* {finding}" for finding in results.get("findings", ())))
-    prose = f"{results['preset']} Each cell: capture rate, seconds to the capture, crash rate. {results.get('note', '')}"
-    todays = [run for run in results["runs"] if "recipe" not in run]
-    return Page(
-        "The quick preset: what two CPU cores learn", prose, parts, Table(SHOWN, todays[:MOST])
-    )
+    """A row per seed of today's recipe."""
+    prose = f"{results['preset']} {results.get('note', '')}"
+    runs = [run for run in results["runs"] if "recipe" not in run]
+    return Page("The quick preset: what two CPU cores learn", prose, Table(SHOWN, runs[:MOST]))
 
 
 def _layout(figure: str, of: Callable):
@@ -180,21 +150,6 @@ SHOWN = {
     "least caught in a layout": _layout("capture_rate", min),
     "crash in `random`": _rate("random", "crash_rate"),
 }
-
-
-def _column(kind, scenario):
-    def show(run):
-        records = {row["scenario"]: row for row in run.get(kind, [])}
-        return _three(records.get(scenario), run["time_step"])
-
-    return show
-
-
-def _three(record, time_step):
-    if record is None:
-        return "–"
-    seconds = record.get("capture_seconds", time_step * record.get("capture_step", 0.0))
-    return f"{record['capture_rate']:.2f}, {seconds:.2f}, {record['crash_rate']:.2f}"
 
 
 def main() -> None:

@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.paper.roster import COLORS, METHODS, flights_of
-from experiments.table import Table, spread
 
 RADII = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
 SPEEDS = (1.0, 1.2, 1.3, 1.4, 1.6, 1.8, 2.0, 2.3, 2.6)
@@ -48,54 +47,6 @@ def seeds_by_method(results: dict) -> dict[str, list[dict]]:
         label: [flight["sweeps"] for flight in flights_of(results, label)] for label in METHODS
     }
     return {label: seeds for label, seeds in methods.items() if seeds}
-
-
-def parts(results: dict) -> list[Table | str]:
-    """A table of either sweep, and where OPEN isn't the best."""
-    methods = seeds_by_method(results)
-    parts = []
-    for title, axis, values, unit in (
-        ("Capture radius, in `empty`", "radius", RADII, "m"),
-        ("Evader speed, in `passage`", "speed", SPEEDS, "m/s"),
-    ):
-        columns = {"method": "method"} | {
-            f"{value} {unit}": at(axis, i) for i, value in enumerate(values)
-        }
-        rows = [{"method": label, "seeds": seeds} for label, seeds in methods.items()]
-        prose = "Capture rate (standard deviation over seeds) / capture step, speed clamp."
-        parts += [Table(columns, rows, title, prose), not_above(methods, axis, values, unit)]
-    return parts
-
-
-def at(axis: str, i: int):
-    """A column: capture rate / capture step at one value."""
-
-    def show(row: dict) -> str:
-        rate = spread([seed[axis]["capture_rate"][i] for seed in row["seeds"]], 2)
-        return f"{rate} / {np.mean([seed[axis]['capture_step'][i] for seed in row['seeds']]):.0f}"
-
-    return show
-
-
-def not_above(methods: dict, axis: str, values: tuple[float, ...], unit: str) -> str:
-    """Where OPEN catches less often than another method, or as often and later."""
-
-    def mean(label, name, i):
-        return np.mean([seed[axis][name][i] for seed in methods[label]])
-
-    axes_found = []
-    for label in methods.keys() - {"OPEN"} if "OPEN" in methods else ():
-        for i, value in enumerate(values):
-            rate, step = (mean(label, name, i) for name in ("capture_rate", "capture_step"))
-            best, early = (mean("OPEN", name, i) for name in ("capture_rate", "capture_step"))
-            if rate > best + 1e-9 or (abs(rate - best) < 1e-9 and step < early):
-                both = f"{rate:.2f} / {step:.0f} against {best:.2f} / {early:.0f}"
-                axes_found.append(f"{label} at {value} {unit} ({both})")
-    return (
-        f"OPEN isn't above: {'; '.join(sorted(axes_found))}."
-        if axes_found
-        else "No method is above OPEN anywhere."
-    )
 
 
 def draw(results: dict, path: Path) -> None:

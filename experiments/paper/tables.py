@@ -18,7 +18,7 @@ import numpy as np
 from experiments.paper import main_tables, sweeps
 from experiments.paper.flights import environment_of, fly
 from experiments.paper.roster import ABLATIONS, METHODS, seeds_of
-from experiments.table import Page, facts, page_parser, write_page
+from experiments.table import facts, page_parser, write_page
 from openjax.background import compile_ahead
 from openjax.baselines import METHODS as HEURISTICS
 from openjax.command_line import run_command
@@ -143,12 +143,6 @@ def study(options: argparse.Namespace) -> None:
         write_json(options.out / "tables.json", results)
 
 
-def page(results: dict) -> Page:
-    """The paper's tables, then the two sweeps."""
-    whole = main_tables.page(results)
-    return dataclasses.replace(whole, parts=(*whole.parts, *sweeps.parts(results)))
-
-
 def main(arguments: list[str]) -> int:
     """Fly or read the flights, then write the page."""
     parser = page_parser(__doc__, ".")
@@ -162,7 +156,7 @@ def main(arguments: list[str]) -> int:
     if not options.report:
         study(options)
     results = read_json(options.out / "tables.json")
-    write_page(options.out / NAME, page, results, sweeps.draw)
+    write_page(options.out / NAME, main_tables.page, results, sweeps.draw)
     return 0
 
 

@@ -81,16 +81,8 @@ def begin(start: str, seed: int, out: Path, cache: Path) -> subprocess.Popen:
     """A run as a process, which keeps programs in a folder of its own."""
     environment = {**os.environ, "XDG_CACHE_HOME": str(cache)}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-    command = [
-        sys.executable,
-        "-m",
-        "openjax.train",
-        "--preset",
-        *shlex.split(start),
-        "--seed",
-        str(seed),
-    ]
-    command += ["--compare_with", "none", "--out", str(out)]
+    command = [sys.executable, "-m", "openjax.train", "--preset", *shlex.split(start)]
+    command += ["--seed", str(seed), "--compare_with", "none", "--out", str(out)]
     with open(out.with_suffix(".log"), "w") as log:
         return subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
 
@@ -187,18 +179,11 @@ def page(results: dict) -> Page:
     }
     prose = f"Uniform validation tasks. An update is the median of a run's. {results['note']}"
     prose += medians(rows)
-    goals = {name: name for name in ("figure", "goal", "value", "machine", "page or command")}
-    parts = [Table(goals, results.get("goals", []), "Goals"), Table(columns, rows, "Runs")]
-    shown = [
+    goals = [
         goal for goal in results.get("goals", []) if "evaders.md" not in goal["page or command"]
     ]
-    short = {name: name for name in ("figure", "goal", "value")}
-    return Page(
-        "Seconds to a policy that catches",
-        prose,
-        [*parts, *results.get("tried", [])],
-        Table(short, shown),
-    )
+    short = Table({name: name for name in ("figure", "goal", "value")}, goals)
+    return Page("Seconds to a policy that catches", prose, Table(columns, rows, "Runs"), short)
 
 
 def medians(rows: list[dict]) -> str:

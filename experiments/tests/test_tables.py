@@ -5,7 +5,7 @@ import importlib
 import pytest
 
 from experiments.evaders.catch_map import fastest_caught
-from experiments.paper import main_tables, sweeps
+from experiments.paper import main_tables
 from experiments.paper.roster import METHODS, seeds_of
 from experiments.paper.values import MAIN
 from experiments.table import RESULTS, with_table
@@ -39,18 +39,6 @@ def test_the_page_says_where_open_is_not_better_and_where_we_are_worse_than_the_
     assert "narrow_gap, APF: capture rate" not in text and "random, OPEN" not in text
 
 
-def test_sweeps_say_where_open_is_not_above():
-    def seeds(rates, steps):
-        return [{"radius": {"capture_rate": rates, "capture_step": steps}}]
-
-    methods = {"APF": seeds([0.5, 1.0], [700, 90]), "OPEN": seeds([0.4, 1.0], [700, 100])}
-    text = sweeps.not_above(methods, "radius", (0.1, 0.3), "m")
-    assert "APF at 0.1 m (0.50 / 700 against 0.40 / 700); APF at 0.3 m" in text
-    assert "No method is above" in sweeps.not_above(
-        {"OPEN": methods["OPEN"]}, "radius", (0.1, 0.3), "m"
-    )
-
-
 STUDIES = {
     "catch_map": "experiments.evaders.catch_map",
     "changes": "experiments.diagnosis.changes",
@@ -58,7 +46,7 @@ STUDIES = {
     "judged": "experiments.evaders.judged",
     "quick": "experiments.paper.quick",
     "seconds": "experiments.speed.seconds",
-    "tab_main": "experiments.paper.tables",
+    "tab_main": "experiments.paper.main_tables",
     "teams": "experiments.evaders.teams",
     "vehicles": "experiments.flying.vehicles",
 }
