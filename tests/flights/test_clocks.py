@@ -17,8 +17,9 @@ from openjax.flights.clocks import (
     read_motor_clock,
 )
 from openjax.flights.flight import Case, Flight
+from openjax.flights.grid import tracks_of
 from openjax.flights.motor_delay import row_torques
-from openjax.flights.track import Track, tracks_of
+from openjax.flights.track import Track
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.vehicle_numbers import with_values
 

@@ -9,7 +9,7 @@ import pytest
 
 from openjax.flights.airborne import airborne_part
 from openjax.flights.flight import Case, Flight
-from openjax.flights.track import TAKE_OFF, flight_tracks, own_tracks
+from openjax.flights.grid import TAKE_OFF, flight_tracks, own_tracks
 from openjax.vehicle.vehicle_file import load_vehicle_file
 
 

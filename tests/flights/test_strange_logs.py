@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.csv_table import read_csv, write_csv
+from openjax.flights.grid import tracks_of
 from openjax.flights.importers import find_logs, load_mapping, read_log
 from openjax.flights.samples import log_of
-from openjax.flights.track import tracks_of
 
 
 def quoted(text):

@@ -13,8 +13,9 @@ from experiments.diagnosis import rate_flights
 from experiments.diagnosis.rate_flights import Truth, fly, rows_of, vehicle_of
 from openjax.flights.clocks import case_on_gyroscope_clock
 from openjax.flights.flight import Case, Flight
+from openjax.flights.grid import own_tracks
 from openjax.flights.kinematics import Kinematics
-from openjax.flights.track import Track, own_tracks
+from openjax.flights.track import Track
 from openjax.gap import evidence
 from openjax.gap.identification.corrections import corrections
 from openjax.gap.identification.estimates import of_fit

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from openjax.flights.flight import Flight
-from openjax.flights.track import flight_tracks
+from openjax.flights.grid import flight_tracks
 from openjax.gap.channels.radio import read_radio
 from openjax.gap.model.library import library
 

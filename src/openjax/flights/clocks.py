@@ -17,15 +17,9 @@ import numpy as np
 from scipy.signal import butter, find_peaks, sosfiltfilt
 
 from openjax.flights.flight import Case
+from openjax.flights.grid import GRID_PERIOD, MAX_GAP, MISSED_SAMPLES
 from openjax.flights.motor_delay import lag_and_delay, row_torques
-from openjax.flights.track import (
-    GRID_PERIOD,
-    MAX_GAP,
-    MISSED_SAMPLES,
-    Track,
-    earlier,
-    turn_increments,
-)
+from openjax.flights.track import Track, earlier, turn_increments
 
 # What a row of motor commands may hold: their mean from its time until the next row,
 # their mean since the last row, or a single one.

@@ -14,8 +14,9 @@ from openjax.flights.clocks import (
     read_motor_clock,
 )
 from openjax.flights.flight import Case
+from openjax.flights.grid import tracks_of
 from openjax.flights.kinematics import Kinematics, correct, read_kinematics
-from openjax.flights.track import Track, tracks_of, without_delay
+from openjax.flights.track import Track, without_delay
 from openjax.gap.channels import Channel
 from openjax.gap.channels.motion import Motion, make_reading, motor_rows, read_motion
 from openjax.gap.channels.pose import Pose, read_pose

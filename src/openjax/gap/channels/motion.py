@@ -12,8 +12,9 @@ import numpy as np
 from openjax.errors import UserError
 from openjax.flights.clocks import ROWS
 from openjax.flights.flight import Case
+from openjax.flights.grid import GRID_PERIOD
 from openjax.flights.kinematics import Kinematics
-from openjax.flights.track import GRID_PERIOD, Track
+from openjax.flights.track import Track
 from openjax.gap.channels.instruments import caused_by_commands, read_feedback
 from openjax.gap.channels.rate_loop import ROW_DELAY, RateLoop
 from openjax.gap.model.baseline import Baseline, with_days

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openjax.flights.track import Track, held_means
+from openjax.flights.grid import held_means
+from openjax.flights.track import Track
 from openjax.gap.channels import Channel, Estimated, few
 from openjax.gap.decision import DECISION
 from openjax.gap.model.library import CARDS

@@ -5,7 +5,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from openjax.flights.flight import Case
-from openjax.flights.track import Track, own_tracks
+from openjax.flights.grid import own_tracks
+from openjax.flights.track import Track
 from openjax.gap.decision import DECISION
 from openjax.gap.identification.estimates import EffectEstimates, of_fit
 from openjax.gap.identification.forces import identify_forces, trims

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.flights.flight import Case, Flight
+from openjax.flights.grid import pwm_thrust
 from openjax.flights.pairs import FULL
 from openjax.flights.signals import RATE, clock_of, first_order, in_band, on_clock
-from openjax.flights.track import GRAVITY, pwm_thrust, to_body
+from openjax.flights.track import GRAVITY, to_body
 
 CLEAR_OF_FLOOR = 0.25  # m, where the ground's cushion is gone
 SETTLED = 0.5  # s after a stretch's begin and before its end that are left out
