@@ -26,7 +26,7 @@ from openjax.plain import from_plain
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
 from openjax.ranges import Interval, check_intervals, ranged_fields
-from openjax.runs.start import TrainCommand
+from openjax.runs.train_command import TrainCommand
 from openjax.virtual_crazyflie.link import LinkFaults
 
 SETTINGS = (

@@ -17,7 +17,7 @@ import tyro
 
 from openjax.__main__ import COMMANDS
 from openjax.errors import UserError
-from openjax.runs import start
+from openjax.runs import request
 
 pytestmark = pytest.mark.slow
 
@@ -79,7 +79,7 @@ def parse_alone(monkeypatch, words: list[str]) -> None:
     arguments = words[2:] if words[0] == "openjax" else words[3:]
     if name.removeprefix("openjax.") in COMMANDS:
         module = importlib.import_module(f"openjax.commands.{name.removeprefix('openjax.')}")
-        for place in (module, start):
+        for place in (module, request):
             if parse := getattr(place, "parse", None):
                 monkeypatch.setattr(place, "parse", lambda *a, p=parse: stop(p, *a))
         module.main(arguments)

@@ -15,7 +15,7 @@ import pytest
 
 from openjax.cluster.joining import Membership, find_membership
 from openjax.errors import UserError
-from openjax.runs.start import membership
+from openjax.runs.request import membership
 from openjax.show.metrics import read_metrics
 from openjax.store.checkpoint_files import is_checkpoint
 

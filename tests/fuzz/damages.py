@@ -41,7 +41,7 @@ def make_checkpoints(folder: Path) -> None:
 
 
 def _tiny_settings():
-    from openjax.runs.start import read_command
+    from openjax.runs.request import read_command
 
     return read_command(TINY).settings
 

@@ -26,7 +26,9 @@ def fuzz_train(rng: random.Random, folder: Path):
     from openjax.cluster.processes import Processes
     from openjax.command_line import option_names
     from openjax.learning import make_start
-    from openjax.runs.start import TrainCommand, membership, prepare, read_command
+    from openjax.runs.request import membership, read_command
+    from openjax.runs.start import prepare
+    from openjax.runs.train_command import TrainCommand
 
     names = _cached("train options", lambda: option_names(TrainCommand()))
     chosen = rng.choices(names, k=rng.randint(1, 3))

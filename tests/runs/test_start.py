@@ -10,7 +10,7 @@ import openjax
 from openjax.commands.calls import train
 from openjax.errors import UserError
 from openjax.learning import preset
-from openjax.runs.start import read_command
+from openjax.runs.request import read_command
 from openjax.runs.train_command import TrainCommand
 from openjax.store.run_directory import RunDirectory
 

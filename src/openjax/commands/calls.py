@@ -19,7 +19,9 @@ from openjax.pursuit import Observation, PursuitSettings
 from openjax.pursuit.evaders import Evader
 from openjax.ranges import changed, check_intervals
 from openjax.runs.job import OwnParts
-from openjax.runs.start import TrainCommand, check_resumed, default_preset, start
+from openjax.runs.request import check_resumed, default_preset
+from openjax.runs.start import start
+from openjax.runs.train_command import TrainCommand
 from openjax.store.policies import LoadedPolicy, load_policy, own_controller
 from openjax.store.run_directory import open_run
 

@@ -23,7 +23,8 @@ def main(arguments: Sequence[str]) -> int:
 
     from openjax.cluster.joining import join
     from openjax.platform import make_cores_devices
-    from openjax.runs.start import membership, read_command, start
+    from openjax.runs.request import membership, read_command
+    from openjax.runs.start import start
 
     # the same numbers by a kernel of JAX's own: written out, they're half of what there
     # is to compile for a GPU
