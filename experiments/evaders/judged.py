@@ -95,7 +95,7 @@ def study(options) -> dict:
 
 TRIED = "tried: "
 """How the names of policies begin that are no weights of the project."""
-SHOWN = 250_000_000
+SHOWN = 500_000_000
 """Steps of each learner whose row is on the page, beside those of the end."""
 
 

@@ -55,12 +55,12 @@ def test_a_slower_vehicle_has_rows_of_its_own():
 def test_the_page_shows_a_short_and_the_whole_budget_of_weights_and_the_planner():
     learned, planner, _ = rows_of("evaders", {"records": RECORDS})
     slower = {**planner, "vehicle": "slower"}
-    spent = [{**learned, "steps": million * 1e6} for million in (100, 250, 420)]
+    spent = [{**learned, "steps": million * 1e6} for million in (100, 500, 900)]
     curves = {"evaders, nominal": spent, "evaders, slower": spent, "tried: more, nominal": spent}
     told = page({"rows": [learned, planner, slower], "curves": curves}).parts.records
     assert [row["judge"] for row in told] == [
-        "learners, 250 M steps",
-        "learners, 420 M steps",
+        "learners, 500 M steps",
+        "learners, 900 M steps",
         "a planner",
     ]
 
