@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from openjax.flying.controller import Pose, moved_on, nominal_airframe
 from openjax.flying.judge import Verdict, judge, offset_of
 from openjax.flying.set_point import MOTORS_OFF
-from openjax.flying.sources import Moment, Source
+from openjax.flying.sources import PoseSource, VehicleTick
 from openjax.flying.state import initial_state
 
 LIMITS = initial_state([], airframe=nominal_airframe()).limits
@@ -105,23 +105,23 @@ def test_what_a_vehicle_can_do_is_believed(push, spin, dt):
 
 
 def moment(time, moving=True):
-    return Moment(time, LIMITS, nominal_airframe(), MOTORS_OFF, moving, airborne=False)
+    return VehicleTick(time, LIMITS, nominal_airframe(), MOTORS_OFF, moving, airborne=False)
 
 
 def test_poses_out_of_order_late_or_from_the_future_change_nothing():
-    source = Source(HERE._replace(time=1.0))
+    source = PoseSource(HERE._replace(time=1.0))
     for time in (0.99, 1.0, 0.5, 1.2, math.nan, math.inf):
         pose = HERE._replace(time=time, position=(0.401, 0.0, 0.5))
         assert source.update(pose, moment(1.01), None) is source
-    assert Source().update(None, moment(1.0), None) == Source()
+    assert PoseSource().update(None, moment(1.0), None) == PoseSource()
 
 
 def test_a_refused_pose_leaves_the_last_good_one():
     wrong = HERE._replace(time=0.01, position=(2.0, 0.0, 0.5))
-    refused = Source(HERE).update(wrong, moment(0.01), None)
-    assert refused == Source(HERE, Verdict.JUMPED, 0.01)
+    refused = PoseSource(HERE).update(wrong, moment(0.01), None)
+    assert refused == PoseSource(HERE, Verdict.JUMPED, 0.01)
     # carried to another place by hand
-    assert Source(HERE).update(wrong, moment(0.01, moving=False), None).pose is wrong
+    assert PoseSource(HERE).update(wrong, moment(0.01, moving=False), None).pose is wrong
 
 
 def test_agreement_is_of_place_and_attitude_at_one_time():

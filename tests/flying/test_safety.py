@@ -15,7 +15,7 @@ from openjax.flying.controller import Pose, accelerate, nominal_airframe, roll_p
 from openjax.flying.limits import fence_velocity, parting_velocity, resting_places, stopping_point
 from openjax.flying.safety import step
 from openjax.flying.set_point import OFF, RATES, SetPoint, from_action
-from openjax.flying.sources import Source
+from openjax.flying.sources import PoseSource
 from openjax.flying.state import (
     Drone,
     Event,
@@ -44,7 +44,7 @@ def pursuing(velocity=(0.0, 0.0, 0.0)):
     state = initial_state(PLACES)
     poses = [Pose(0.0, p, velocity, LEVEL) for p in PLACES]
     drones = tuple(
-        Drone(Mode.PURSUIT, estimate=p, own=Source(p), seen=0.0, sent=POLICY) for p in poses
+        Drone(Mode.PURSUIT, estimate=p, own=PoseSource(p), seen=0.0, sent=POLICY) for p in poses
     )
     return state._replace(drones=drones)
 
@@ -243,7 +243,7 @@ def test_the_estimator_on_board_is_told_what_is_near_it_and_no_more():
 )
 def test_what_is_out_of_limits_ends_the_game_for_all(pose, reason):
     state = pursuing()
-    drone = state.drones[1]._replace(own=Source(pose), estimate=pose)
+    drone = state.drones[1]._replace(own=PoseSource(pose), estimate=pose)
     state = state._replace(drones=(state.drones[0], drone, state.drones[2]))
     seen = pose._replace(
         time=0.01, position=(pose.position[0] + 0.01 * pose.velocity[0] + 1e-4, *pose.position[1:])
@@ -291,7 +291,7 @@ def test_who_leans_the_wrong_way_turns_before_it_pushes():
 def test_upside_down_for_long_its_motors_are_off_and_the_others_land():
     state = pursuing()
     over = (0.1, 0.995, 0.0, 0.0)
-    drone = state.drones[1]._replace(own=Source(Pose(0.0, PLACES[1], (0.0,) * 3, over)))
+    drone = state.drones[1]._replace(own=PoseSource(Pose(0.0, PLACES[1], (0.0,) * 3, over)))
     state = state._replace(drones=(state.drones[0], drone, state.drones[2]))
     for k in range(1, 20):
         seen = PoseSample(still(0.01 * k, PLACES[1], quaternion=over), 0.01 * k, 4.0)

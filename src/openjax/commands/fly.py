@@ -160,7 +160,7 @@ class Prepared(NamedTuple):
     seconds: float = math.inf  # that it may take in the air
 
 
-class Course(NamedTuple):
+class Assignment(NamedTuple):
     """A policy's game or a plan that will be flown, before its vehicle is known."""
 
     game: Callable  # airframe -> the game, compiled
@@ -178,21 +178,21 @@ def prepare(arguments: FlyCommand) -> Prepared:
     from openjax.vehicle.vehicle_file import load_vehicle_file
 
     real_time.prepare()
-    course = _game(arguments) if arguments.plan is None else _plan(arguments)
-    vehicle = load_vehicle_file(arguments.vehicle or course.airframe)
+    assignment = _game(arguments) if arguments.plan is None else _plan(arguments)
+    vehicle = load_vehicle_file(arguments.vehicle or assignment.airframe)
     session = _session(arguments)  # before the game, which takes its time to compile
-    game = course.game(airframe_of(vehicle.vehicle))
+    game = assignment.game(airframe_of(vehicle.vehicle))
     state = flight_state(game, len(session.uris), arguments.safety)
-    remarks = course.remarks
-    if course.airframe not in (None, vehicle.airframe):
-        other = f"the policy was trained for {course.airframe}, but {vehicle.airframe} flies"
+    remarks = assignment.remarks
+    if assignment.airframe not in (None, vehicle.airframe):
+        other = f"the policy was trained for {assignment.airframe}, but {vehicle.airframe} flies"
         remarks = (*remarks, other)
-    remarks = (*remarks, *_time_remark(arguments, course.seconds))
-    about = course.about | {"uris": session.uris}
-    return Prepared(game, state, session, vehicle, about, remarks, course.seconds)
+    remarks = (*remarks, *_time_remark(arguments, assignment.seconds))
+    about = assignment.about | {"uris": session.uris}
+    return Prepared(game, state, session, vehicle, about, remarks, assignment.seconds)
 
 
-def _game(arguments: FlyCommand) -> Course:
+def _game(arguments: FlyCommand) -> Assignment:
     """A policy's game in a layout."""
     from openjax.flying.game import Game
     from openjax.pursuit import PursuitSettings, find_scenario, scenario_task
@@ -218,10 +218,12 @@ def _game(arguments: FlyCommand) -> Course:
         period = round(settings.strategy_steps * settings.time_step, 6)
         about |= {"strategies": settings.strategies, "strategy_seconds": period}
     remarks = (line,) if line else ()
-    return Course(functools.partial(Game, policy, task), settings.airframe, about, seconds, remarks)
+    return Assignment(
+        functools.partial(Game, policy, task), settings.airframe, about, seconds, remarks
+    )
 
 
-def _plan(arguments: FlyCommand) -> Course:
+def _plan(arguments: FlyCommand) -> Assignment:
     """A plan in a policy's place."""
     from openjax.flights.manoeuvres import PERIOD
     from openjax.flights.plans import read_plan
@@ -230,7 +232,7 @@ def _plan(arguments: FlyCommand) -> Course:
     plan = read_plan(arguments.plan)
     source = f"plan {arguments.plan}"
     about = {"policy": source, "scenario": source}
-    return Course(functools.partial(PlannedFlight, plan), None, about, len(plan) * PERIOD)
+    return Assignment(functools.partial(PlannedFlight, plan), None, about, len(plan) * PERIOD)
 
 
 def _session(arguments: FlyCommand):

@@ -40,7 +40,7 @@ class Episode:
     play: Play  # of its newest tick
 
 
-class Course:
+class FlightCourse:
     """What a flight does next, and the games that it plays.
 
     Args:

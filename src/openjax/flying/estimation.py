@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from openjax.flying.controller import level_acceleration, moved_on
 from openjax.flying.drift import drifting
 from openjax.flying.judge import Verdict, offset_of
-from openjax.flying.sources import Moment, with_motion
+from openjax.flying.sources import VehicleTick, with_motion
 from openjax.flying.state import FLYING, SPIN_UP, Drone, Mode, PoseSample, State
 
 AIRBORNE = (Mode.TRANSFER, Mode.READY, Mode.PURSUIT, Mode.HOLD, Mode.LAND)
@@ -54,7 +54,7 @@ def _estimate(state, drone, sample) -> Drone:
     """The drone with its estimate now, after what was newly told of it."""
     time = state.time
     spins_up = drone.mode is Mode.LIFT and time - drone.since < SPIN_UP
-    moment = Moment(
+    tick = VehicleTick(
         time,
         state.limits,
         state.airframe,
@@ -64,11 +64,11 @@ def _estimate(state, drone, sample) -> Drone:
     )
     has_capture = sample.captured is not None
     if not drone.own.fault:
-        drone = _with_own(drone, sample, moment, has_capture and not drone.captured.fault)
+        drone = _with_own(drone, sample, tick, has_capture and not drone.captured.fault)
     if has_capture and not drone.captured.fault:
-        drone = _with_capture(drone, sample, moment)
+        drone = _with_capture(drone, sample, tick)
     source = drone.captured if has_capture and not drone.captured.fault else drone.own
-    if source.fresh(moment) and not source.fault:
+    if source.fresh(tick) and not source.fault:
         estimate = moved_on(source.pose, max(time, source.pose.time))
         level = level_acceleration(estimate.quaternion)
         return drone._replace(estimate=estimate, seen=source.pose.time, acceleration=level)
@@ -86,26 +86,26 @@ def _reckon(state, drone) -> Drone:
     return drone._replace(estimate=estimate)
 
 
-def _with_own(drone, sample, moment, by_capture) -> Drone:
+def _with_own(drone, sample, tick, by_capture) -> Drone:
     """The drone after its newest own estimate. `by_capture`: whether it is flown by motion
     capture, which must confirm its own where that was lost or wrong.
     """
     estimates = drone.own
     capture = drone.captured
-    limits = moment.limits
-    is_led = by_capture and estimates.fresh(moment)
+    limits = tick.limits
+    is_led = by_capture and estimates.fresh(tick)
     # what it is flown by is motion capture: that says nothing of where its own leads
-    newer = estimates.update(sample.own, moment, None if is_led else drone.estimate)
+    newer = estimates.update(sample.own, tick, None if is_led else drone.estimate)
     is_new = newer.pose is not estimates.pose
-    to_confirm = is_new and by_capture and not is_led and moment.moving and capture.fresh(moment)
+    to_confirm = is_new and by_capture and not is_led and tick.moving and capture.fresh(tick)
     if to_confirm and not offset_of(capture.pose, newer.pose).is_agreement(limits):
         newer = newer._replace(pose=estimates.pose, verdict=Verdict.JUMPED)
         is_new = False
-    next_own = estimates.check_motion(newer, moment, sample.force)
+    next_own = estimates.check_motion(newer, tick, sample.force)
     if not is_new:
         # what told nothing but wrong poses until it was lost may tell believable ones,
         # of another place, once anything can have happened
-        is_lost = moment.airborne and not (estimates.fresh(moment) or capture.fresh(moment))
+        is_lost = tick.airborne and not (estimates.fresh(tick) or capture.fresh(tick))
         return drone._replace(own=next_own._replace(fault=next_own.verdict if is_lost else ""))
     drone = drone._replace(own=next_own)
     # where motion capture tells otherwise than the estimate, it isn't what that followed
@@ -115,28 +115,28 @@ def _with_own(drone, sample, moment, by_capture) -> Drone:
         return drone
     # what the estimator on board follows can't confirm it: neither is believed any more,
     # back to where the sums say that the vehicle is
-    estimate = moved_on(next_own.innovations.corrected_pose(), moment.time)
+    estimate = moved_on(next_own.innovations.corrected_pose(), tick.time)
     return drone._replace(estimate=estimate, captured=capture._replace(fault=next_own.fault))
 
 
-def _with_capture(drone, sample, moment) -> Drone:
+def _with_capture(drone, sample, tick) -> Drone:
     """The drone after the newest of motion capture: whether it is believed, and told to
     the estimator on board.
     """
     estimates = drone.own
     capture = drone.captured
     pose = with_motion(sample.captured, capture.pose, sample.own)
-    newer = capture.update(pose, moment, drone.estimate)
+    newer = capture.update(pose, tick, drone.estimate)
     if newer.pose is pose:
         feeds = True
         # on the ground, or with no pose of its own, there is nothing to compare it with
-        if moment.moving and estimates.pose is not None:
+        if tick.moving and estimates.pose is not None:
             offset = offset_of(pose, estimates.pose)
-            feeds = offset.is_error(moment.limits)
-            if estimates.fresh(moment) and not offset.is_agreement(moment.limits):
+            feeds = offset.is_error(tick.limits)
+            if estimates.fresh(tick) and not offset.is_agreement(tick.limits):
                 newer = newer._replace(pose=capture.pose, verdict=Verdict.APART)
         drone = drone._replace(feeds_estimator=feeds)
-    newer = capture.check_motion(newer, moment)
-    if moment.moving and not newer.fault and not newer.fresh(moment):
+    newer = capture.check_motion(newer, tick)
+    if tick.moving and not newer.fault and not newer.fresh(tick):
         newer = newer._replace(fault=newer.verdict or "pose lost")
     return drone._replace(captured=newer)

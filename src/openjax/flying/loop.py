@@ -10,7 +10,7 @@ from time import perf_counter
 
 import numpy as np
 
-from openjax.flying.course import Course, FlightPlan
+from openjax.flying.course import FlightCourse, FlightPlan
 from openjax.flying.estimation import see
 from openjax.flying.flight_record import FlightRecord
 from openjax.flying.game import Game
@@ -62,7 +62,7 @@ class FlightLoop:
         self.vehicles = vehicles
         self.state = state
         self.record = record or FlightRecord(len(state.drones))
-        self.course = Course(game, plan, self.record)
+        self.course = FlightCourse(game, plan, self.record)
         self._requests = requests
         self._watch = watch
         self._alarm = ""

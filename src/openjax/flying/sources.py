@@ -18,7 +18,7 @@ SMOOTHING = 0.02
 """Time constant of the low-pass of velocities from motion capture (s)."""
 
 
-class Moment(NamedTuple):
+class VehicleTick(NamedTuple):
     """One vehicle at one tick, as far as its sources must know."""
 
     time: float  # s
@@ -29,7 +29,7 @@ class Moment(NamedTuple):
     airborne: bool  # whether nothing but air carries it: then thrust tells its acceleration
 
 
-class Source(NamedTuple):
+class PoseSource(NamedTuple):
     """One source of a vehicle's poses up to now."""
 
     pose: Pose | None = None  # the last good one
@@ -38,11 +38,11 @@ class Source(NamedTuple):
     innovations: Innovations = Innovations()
     fault: str = ""  # why none of its poses is believed any more in this flight
 
-    def fresh(self, moment: Moment) -> bool:
+    def fresh(self, tick: VehicleTick) -> bool:
         """True if its last good pose is new enough to fly by."""
-        return self.pose is not None and moment.time - self.pose.time <= moment.limits.horizon
+        return self.pose is not None and tick.time - self.pose.time <= tick.limits.horizon
 
-    def update(self, pose: Pose | None, moment: Moment, prediction: Pose | None) -> "Source":
+    def update(self, pose: Pose | None, tick: VehicleTick, prediction: Pose | None) -> "PoseSource":
         """The source after its newest pose.
 
         A pose that isn't newer than the last good one, or old, or from the future,
@@ -50,10 +50,10 @@ class Source(NamedTuple):
         one. `prediction`: see `judge`; at any time.
         """
         last = self.pose
-        limits = moment.limits
-        if pose is None or not abs(moment.time - pose.time) <= limits.horizon:
+        limits = tick.limits
+        if pose is None or not abs(tick.time - pose.time) <= limits.horizon:
             return self
-        if last is None or not moment.moving:
+        if last is None or not tick.moving:
             verdict = judge(pose, None, 0.0, limits)
         elif pose.time <= last.time:
             return self
@@ -64,19 +64,19 @@ class Source(NamedTuple):
         return self._replace(pose=last if verdict else pose, verdict=verdict, last_time=pose.time)
 
     def check_motion(
-        self, newer: "Source", moment: Moment, force: Vector | None = None
-    ) -> "Source":
+        self, newer: "PoseSource", tick: VehicleTick, force: Vector | None = None
+    ) -> "PoseSource":
         """`newer`, which is this source after a pose, with that pose's innovations; without
         the pose, and not to be believed any more, if they contradict physics.
 
         `force`: of the accelerometer, see `Innovations.update`.
         """
-        if not moment.airborne:
+        if not tick.airborne:
             return newer._replace(innovations=Innovations())
         if newer.pose is self.pose:
             return newer
         innovations = self.innovations.update(
-            newer.pose, as_sent(moment.command), moment.airframe, bool(self.verdict), force
+            newer.pose, as_sent(tick.command), tick.airframe, bool(self.verdict), force
         )
         fault = innovations.verdict()
         if fault:

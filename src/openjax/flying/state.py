@@ -10,7 +10,7 @@ from openjax.flying.controller import Airframe, Pose, Vector, nominal_airframe
 from openjax.flying.crtp import Supervisor
 from openjax.flying.judge import PoseLimits
 from openjax.flying.set_point import MOTORS_OFF, SetPoint
-from openjax.flying.sources import Source
+from openjax.flying.sources import PoseSource
 from openjax.ranges import Interval, check_intervals
 from openjax.vehicle.arena import Arena
 
@@ -18,7 +18,7 @@ SPIN_UP = 0.3
 """A vehicle that lifts off may stand still for so long (s)."""
 FORCE_AGE = 0.025
 """An accelerometer's sample tells of a pose that was measured no longer (s) before or after it."""
-_NOTHING_SEEN = Source()
+_NOTHING_SEEN = PoseSource()
 
 
 @dataclass(frozen=True)
@@ -156,8 +156,8 @@ class Drone(NamedTuple):
     since: float = 0.0  # s, when the mode began
     # where it is now: the newest pose, moved on to this tick
     estimate: Pose | None = None
-    own: Source = _NOTHING_SEEN  # its own estimates
-    captured: Source = _NOTHING_SEEN  # motion capture, with velocity and rates
+    own: PoseSource = _NOTHING_SEEN  # its own estimates
+    captured: PoseSource = _NOTHING_SEEN  # motion capture, with velocity and rates
     # whether the estimator on board is to follow the newest of it
     feeds_estimator: bool = True
     seen: float = -math.inf  # s, when the pose that it is flown by was measured
