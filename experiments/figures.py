@@ -98,10 +98,9 @@ def hold() -> str:
         f"`{DEFAULT_POLICY}` catches the hardest evader that learned against it for "
         f"{billions(points[0])} billion steps in {first['uniform']:.2f} of uniform tasks, and in "
         f"{worst(first):.2f} of the episodes of its worst layout. After {billions(points[-1])} "
-        f"billion steps it is {last['uniform']:.2f} and {worst(last):.2f}. It catches "
-        "an evader that plans in the true simulation in "
-        f"{planner['uniform']:.2f} of uniform tasks, and in {worst(planner):.2f} of its worst "
-        "layout.",
+        f"billion steps it is {last['uniform']:.2f} and {worst(last):.2f}. It catches an evader "
+        f"that plans in the true simulation in {planner['uniform']:.2f} of uniform tasks, and in "
+        f"{worst(planner):.2f} of its worst layout.",
         WIDTH,
     )
 

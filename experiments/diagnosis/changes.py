@@ -145,10 +145,8 @@ def page(results: dict) -> Page:
     """The figures."""
     prose = (
         "Two sets of flights of one vehicle are compared; what was changed is known. The real "
-        "flights are open: they were in "
-        "sight when the priors were settled. The sample flights' seeds were not. Sizes are of a "
-        "rotor's thrust, or of what "
-        "changed."
+        "flights are open: they were in sight when the priors were settled. The sample flights' "
+        "seeds were not. Sizes are of a rotor's thrust, or of what changed."
     )
     return Page("What changed", prose, figures_of(results["records"]))
 

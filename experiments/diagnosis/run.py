@@ -83,10 +83,9 @@ def page(results: dict) -> Page:
     """The figures of each column, then where they miss."""
     digests = ", ".join(f"{c} {d[:16]}" for c, d in results["answers_sha256"].items())
     prose = (
-        "Cases are flown, their answers sealed, the logs diagnosed, the answers opened, once. "
-        f"In brackets: 95 % interval. Seed {results['seed']}; SHA-256 of the answers: "
-        f"{digests or 'given'}. "
-        f"{results['note']}"
+        "Cases are flown, their answers sealed, the logs diagnosed, the answers opened, once. In "
+        f"brackets: 95 % interval. Seed {results['seed']}; SHA-256 of the answers: "
+        f"{digests or 'given'}. {results['note']}"
     )
     table, misses = (
         "\n".join(part(results["cases"])) for part in (figures.figures_table, figures.misses)

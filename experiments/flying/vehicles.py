@@ -128,10 +128,9 @@ def page(results: dict) -> Page:
     return Page(
         "Policies on other vehicles",
         f"No clamp, rate loop at 500 Hz, drawn starts, contacts of `rigid`; {results['number']} "
-        "uniform validation tasks, "
-        f"{results['layouts']} episodes of each layout. Nominal: the nominal vehicle; table: "
-        "motors 40 ms slower, commands 15 ms "
-        "and poses 10 ms late, drag of .0125 N s/m; family: the vehicles of the preset flight, "
+        f"uniform validation tasks, {results['layouts']} episodes of each layout. Nominal: the "
+        "nominal vehicle; table: motors 40 ms slower, commands 15 ms and poses 10 ms late, drag of "
+        ".0125 N s/m; family: the vehicles of the preset flight, "
         "half of them rare ones. " + results.get("note", ""),
         over_layouts(results),
     )

@@ -35,12 +35,10 @@ def page(results: dict) -> Page:
     return Page(
         "The paper's tables",
         f"{results['episodes']} episodes per seed and layout, drawn starts. A cell holds ours / "
-        "the paper's, each the mean "
-        "(standard deviation over three seeds: of the training, or of the start attitudes where "
-        "nothing was trained). "
-        "The paper has no `hidden`. Collision rate: share of steps in which any pursuer is too "
-        "near to anything. Crash "
-        "rate: share of episodes in which any pursuer touches something solid or tips over.",
+        "the paper's, each the mean (standard deviation over three seeds: of the training, or of "
+        "the start attitudes where nothing was trained). The paper has no `hidden`. Collision "
+        "rate: share of steps in which any pursuer is too near to anything. Crash rate: share of "
+        "episodes in which any pursuer touches something solid or tips over.",
         (
             Table(
                 columns, cells(results, METHODS, "clamp", LAYOUTS), "Speed clamp, as in the paper"

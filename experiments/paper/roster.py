@@ -16,14 +16,8 @@ ABLATIONS = {"MAPPO + predictor": "predictor", "MAPPO + generator": "generator"}
 """The paper's other variants: MAPPO + EPN, MAPPO + AEG."""
 SEEDS = 3
 HUES = (
-    "tab:orange",
-    "tab:olive",
-    "tab:brown",
-    "tab:purple",
-    "0.3",
-    "tab:red",
-    "tab:blue",
-    "tab:green",
+    *("tab:orange", "tab:olive", "tab:brown", "tab:purple"),
+    *("0.3", "tab:red", "tab:blue", "tab:green"),
 )
 COLORS = dict(zip((*METHODS, *ABLATIONS), HUES, strict=True))
 

@@ -45,7 +45,10 @@ def measure(worlds: int, steps: int, contacts: bool, way: str) -> dict:
         state = state.replace(step=jax.numpy.arange(worlds, dtype=jax.numpy.int32) % length)
         advance = restarting(environment, keys, action)
     else:
-        advance = plain(environment, key, action)
+        step = jax.vmap(environment.step, in_axes=(None, 0, 0))
+
+        def advance(state):
+            return step(key, state, action)[1]
 
     def fly(state):
         return jax.lax.scan(lambda s, _: (advance(s), None), state, length=steps)[0]
@@ -66,14 +69,6 @@ def measure(worlds: int, steps: int, contacts: bool, way: str) -> dict:
         "environment_steps_a_second": worlds * steps / min(seconds),
         "drone_steps_a_second": worlds * pursuers * steps / min(seconds),
     }
-
-
-def plain(environment, key, action):
-    """The step of all worlds, whose episodes may end."""
-    import jax
-
-    step = jax.vmap(environment.step, in_axes=(None, 0, 0))
-    return lambda state: step(key, state, action)[1]
 
 
 def restarting(environment, keys, action):

@@ -11,15 +11,8 @@ from experiments.table import Page, Table, page_parser, publish, write_page
 
 
 def test_results_name_the_command_without_their_own_places_and_the_commit(tmp_path, monkeypatch):
-    arguments = [
-        "--number",
-        "3",
-        "--name",
-        "two words",
-        "--commit=abc",
-        "--out",
-        str(tmp_path / "page"),
-    ]
+    arguments = ["--number", "3", "--name", "two words", "--commit=abc"]
+    arguments += ["--out", str(tmp_path / "page")]
     monkeypatch.setattr(sys, "argv", ["study", *arguments])
     parser = page_parser("A study.", "page")
     parser.add_argument("--number", type=int)

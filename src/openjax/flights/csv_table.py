@@ -101,9 +101,8 @@ def _not_numbers(bad: np.ndarray, names: list[str]) -> list[str]:
     for name, count in zip(names, bad.sum(0).tolist(), strict=True):
         columns_of.setdefault(count, []).append(name)
     return [
-        f"column{'s' * (len(columns) > 1)} {name_list(columns)}: "
-        f"{count} of {len(bad)} rows are NaN "
-        "or infinite"
+        f"column{'s' * (len(columns) > 1)} {name_list(columns)}: {count} of {len(bad)} rows are "
+        "NaN or infinite"
         for count, columns in columns_of.items()
         if count
     ]
@@ -157,9 +156,8 @@ def _check_header(header: Header, time: str) -> None:
     if time not in names:
         time_name = "t" if time == "t" else f"{time!r}, which columns.toml names for t"
         raise LogError(
-            f"no column {time_name}; the log has {name_list(n for n in names if n)}: "
-            "say in columns.toml "
-            "which is which"
+            f"no column {time_name}; the log has {name_list(n for n in names if n)}: say in "
+            "columns.toml which is which"
         )
 
 

@@ -146,12 +146,10 @@ class SignalPair:
         columns = ", ".join(n for n, b in zip(self.names, self.bad, strict=True) if b)
         low, high = self.band
         return (
-            f"contradictory: {columns} against {self.what}: "
-            f"correlation {agreement.correlation[worst]:.2f} "
-            f"where sensors allow {agreement.expectation[worst]:.2f} "
-            f"({agreement.signal[worst]:.2g} against "
-            f"{agreement.reference[worst]:.2g} {self.unit} "
-            f"from {low:g} to {high:g} Hz)"
+            f"contradictory: {columns} against {self.what}: correlation "
+            f"{agreement.correlation[worst]:.2f} where sensors allow "
+            f"{agreement.expectation[worst]:.2f} ({agreement.signal[worst]:.2g} against "
+            f"{agreement.reference[worst]:.2g} {self.unit} from {low:g} to {high:g} Hz)"
         )
 
 

@@ -142,6 +142,5 @@ def rows_at_random(flight: Flight) -> Iterator[str]:
             names = ", ".join(n for n, b in zip(CHANNEL_COLUMNS[channel], bad, strict=True) if b)
             yield (
                 f"contradictory: the rows of {names} follow each other at random "
-                f"({100 * ratio[bad].max():.0f} % of "
-                "the variance from one row to the next)"
+                f"({100 * ratio[bad].max():.0f} % of the variance from one row to the next)"
             )

@@ -63,9 +63,8 @@ def flights_of(
     ids = list(dict.fromkeys(table.vehicle.tolist()))
     if len(ids) > MOST_VEHICLES:
         raise LogError(
-            f"column vehicle holds {len(ids)} ids, {name_list(ids, 3)}; "
-            "it names which vehicle a row "
-            "belongs to"
+            f"column vehicle holds {len(ids)} ids, {name_list(ids, 3)}; it names which vehicle a "
+            "row belongs to"
         )
     flights = []
     for vehicle_id in ids:

@@ -79,10 +79,9 @@ class FirstFlightsProgram:
             loss = {name: float(value) for name, value in parts.items()}
             seconds_left = (time.monotonic() - start) * (self.updates / updates_done - 1.0)
             say(
-                f"{updates_done} of {self.updates} updates, {duration(seconds_left)} left "
-                "| evader out of reach "
-                f"{loss['free']:.0%} of the time, the nearest pursuer {loss['distance']:.2f} m too "
-                f"far, close to a crash {loss['crashes']:.1%}"
+                f"{updates_done} of {self.updates} updates, {duration(seconds_left)} left | evader "
+                f"out of reach {loss['free']:.0%} of the time, the nearest pursuer "
+                f"{loss['distance']:.2f} m too far, close to a crash {loss['crashes']:.1%}"
             )
         return parameters.replace(actor=carry.actor.parameters)
 

@@ -67,8 +67,7 @@ def closing_words(
     seconds = game.episode_length * game.time_step
     lines = [
         "A crash: any drone touches the floor, a pillar or another drone, or tips over, at any "
-        "time of "
-        f"the {seconds:.0f} s, after the capture, too."
+        f"time of the {seconds:.0f} s, after the capture, too."
     ]
     if differs := unlike_the_papers(game, game.evaders):
         lines.append(differs)
