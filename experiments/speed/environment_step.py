@@ -56,12 +56,7 @@ def measure(worlds: int, steps: int, contacts: bool, way: str) -> dict:
     began = time.perf_counter()
     program = jax.jit(fly).lower(state).compile()
     compiling = time.perf_counter() - began
-    jax.block_until_ready(program(state))
-    seconds = []
-    for _ in range(REPEATS):
-        began = time.perf_counter()
-        jax.block_until_ready(program(state))
-        seconds.append(time.perf_counter() - began)
+    _, *seconds = [timed(program, state) for _ in range(1 + REPEATS)]
     return {
         "device": jax.devices()[0].device_kind,
         "way": way,
@@ -69,6 +64,15 @@ def measure(worlds: int, steps: int, contacts: bool, way: str) -> dict:
         "environment_steps_a_second": worlds * steps / min(seconds),
         "drone_steps_a_second": worlds * pursuers * steps / min(seconds),
     }
+
+
+def timed(program, state) -> float:
+    """Seconds of a call."""
+    import jax
+
+    began = time.perf_counter()
+    jax.block_until_ready(program(state))
+    return time.perf_counter() - began
 
 
 def restarting(environment, keys, action):
