@@ -1,5 +1,5 @@
-"""Another policy in the game of a run, which it wasn't trained for: beside the run's
-own it shows what the run was worth.
+"""Another policy flown in a run's game. The report shows it beside the policy that the run
+trained.
 """
 
 import dataclasses
@@ -15,8 +15,8 @@ from openjax.store.policies import LoadedPolicy, load_policy
 
 
 def game_for(environment: Pursuit, policy: LoadedPolicy) -> Pursuit:
-    """A game for another policy than it was made for, which sees and steers as it was
-    trained to; episodes last as long.
+    """The game as a policy of another one can play it: the policy observes and commands as it
+    was trained to, and episodes last as long.
     """
     settings = environment.settings
     game = policy.settings.environment
@@ -39,7 +39,7 @@ class OtherPolicy:
     environment: Pursuit
     """The game as this policy sees it and steers in it."""
     run: PursuitSettings
-    """Of the run's own game."""
+    """Settings of the run's own game."""
 
     def fly(
         self, scenarios: Sequence[Scenario], episodes: int, validation: int
