@@ -184,6 +184,21 @@ def test_motors_that_are_logged_some_cycles_late_are_not_slow(cycles):
             assert pair.measured.at(5.0)[0] == pytest.approx(pair.simulated.at(5.0)[0], rel=0.06)
 
 
+@pytest.mark.parametrize("name", ["nominal", "slow motors"])
+def test_rows_of_means_whose_motors_are_logged_late_are_not_quick_and_weak(name):
+    """Motors late by part of a row hold the search at its beginning; late by more, they
+    have the larger likelihood there.
+    """
+    truth = TRUTHS[name]
+    (seen,), (motors,) = fly([truth], 20.0)
+    for cycles in (2, 3, 6):
+        late = np.roll(motors, cycles, axis=0)
+        fit = identify_torques([record_of("late", seen[10:], late[10:], 100)])
+        assert fit.clock == pytest.approx(truth.delay - 0.002 * cycles, abs=0.0015)
+        assert fit.value[:2] == pytest.approx([truth.up, truth.down], rel=1.0 / 6.0)
+        assert fit.value[3:6] == pytest.approx(1.0, abs=0.12)
+
+
 def test_no_line_stands_for_motors_that_were_not_logged():
     rng = np.random.default_rng(0)
     time = 0.01 * np.arange(960)

@@ -5,7 +5,7 @@ from dataclasses import replace
 from openjax.flights.track import Track
 from openjax.gap.identification.prediction_errors import Problem, earlier
 from openjax.gap.identification.row_errors import HALF_CYCLE
-from openjax.gap.identification.search import TorqueFit, begin, search
+from openjax.gap.identification.search import TorqueFit, begin, earliest, search
 
 FAST_ROWS = 0.005  # s: slower rows show 2 ms of delay in its place
 AHEAD = (0.006, 0.012, 0.02, 0.04, 0.08)  # s by which motors are tried earlier than logged
@@ -21,32 +21,55 @@ def identify_torques(records: list[Track], one_clock: bool = True) -> TorqueFit:
     where streams share no `one_clock`, none is looked for.
     """
     base = Problem(records)
-    first = _first_fit(base)
+    fits = _first_fits(base)
     if base.dt < FAST_ROWS:
         # Whether such rows are of the filtered gyroscope nobody says, but they show it.
         low_pass_problem = Problem(records, low_pass=True)
-        other = _first_fit(low_pass_problem)
-        if other.loss < first.loss - CLEARLY:
-            base, first = low_pass_problem, other
-    if _clear(first) or not one_clock:
+        others = _first_fits(low_pass_problem)
+        if _best(base, others).loss < _best(base, fits).loss - CLEARLY:
+            base, fits = low_pass_problem, others
+    first = _best(base, fits)
+    if not one_clock or (_clear(first) and not all(_begins(base, *f) for f in fits.items())):
         return first
-    fits = [first, search(base, begin(base, LATE[1]))]
-    fits += [_earlier_fit(base, rows) for rows in {round(s / base.dt): None for s in AHEAD} if rows]
-    return min(fits, key=lambda f: f.loss)
+    late = search(base, begin(base, LATE[1]))
+    fits[0] = min(fits[0], late, key=lambda f: f.loss)
+    for seconds in AHEAD:
+        rows = round(seconds / base.dt)
+        if rows not in fits:
+            fits[rows] = _earlier_fit(base, rows)
+    return _best(base, fits)
 
 
-def _first_fit(base: Problem) -> TorqueFit:
-    """The fit from a usual delay. Where rows show each cycle of the rate loop, motors that
-    were logged some cycles too late hold the search in a place with slow and weak ones, so
-    it begins before them as well, and earlier still where it ends at its beginning.
+def _first_fits(base: Problem) -> dict[int, TorqueFit]:
+    """{rows by which motors are earlier: the fit from a usual delay}. Motors that were
+    logged too late hold the search at its beginning, with lags and gains too small, so it
+    goes on before that. Where rows show each cycle of the rate loop it may be held further
+    on, with slow and weak motors, so it begins earlier there in any case.
     """
-    fits = [search(base, begin(base, LATE[0]))]
-    if not base.records[0].hides_ticks:
-        for cycles in AHEAD[:2]:
-            fits.append(_earlier_fit(base, round(cycles / base.dt)))
-            if fits[-1].clock > HALF_CYCLE - cycles:
-                break
-    return min(fits, key=lambda f: f.loss)
+    rows = 0
+    fits = {rows: search(base, begin(base, LATE[0]))}
+    hides_ticks = base.records[0].hides_ticks
+    for seconds in AHEAD[:2]:
+        if (hides_ticks or rows) and not _begins(base, rows, fits[rows]):
+            break
+        rows = max(round(seconds / base.dt), 1)
+        if rows not in fits:
+            fits[rows] = _earlier_fit(base, rows)
+    return fits
+
+
+def _best(base: Problem, fits: dict[int, TorqueFit]) -> TorqueFit:
+    """The likeliest of those that don't end at the beginning of their search, if there are
+    such: what rows hide counts for motors that act before they are logged.
+    """
+    return min(fits.items(), key=lambda item: (_begins(base, *item), item[1].loss))[1]
+
+
+def _begins(base: Problem, rows: int, fit: TorqueFit) -> bool:
+    """True if a fit with motors so many rows earlier ends at the beginning of its search,
+    and the motors' clock may lie before that.
+    """
+    return fit.clock + rows * base.dt < earliest(base.records[0]) + HALF_CYCLE
 
 
 def _earlier_fit(base: Problem, rows: int) -> TorqueFit:
