@@ -1,6 +1,6 @@
 """What an identification of torques makes of flights with known truth: rows of 100, 250
-and 500 Hz, means and samples, calm air and strong gusts; and of folders of real
-flights, where only the simulator's numbers stand beside.
+and 500 Hz, means and samples, motors logged in time and late, calm air and strong
+gusts; and of folders of real flights, where only the simulator's numbers stand beside.
 
     python -m experiments.diagnosis.identification --out experiments/results/identification.json
 """
@@ -10,10 +10,11 @@ import dataclasses
 import itertools
 import json
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from experiments.diagnosis.rate_flights import Truth, fly, rows_of, vehicle_of
+from experiments.diagnosis.rate_flights import TICK, Truth, fly, rows_of, vehicle_of
 from openjax.flights.case import load_case
 from openjax.flights.track import Track
 from openjax.gap.identification.prediction_errors import NAMES, Problem
@@ -38,14 +39,31 @@ VEHICLES = BRUSHED | {
     "inertia": Truth(inertia=1.3),
     "damped": Truth(damping=4.0),
 }
+
+
+class Rows(NamedTuple):
+    """How a flight is logged: rate, Hz; whether motors are samples; whether what is new in
+    a row may act on its end; of how many flights; s by which motors are logged late.
+    """
+
+    rate: int
+    samples: bool = False
+    free: bool = True
+    seeds: int = SEEDS
+    late: float = 0.0
+
+
 ROWS = {
-    "100 Hz means": (100, False, True, SEEDS),
-    "100 Hz means, direct": (100, False, False, SEEDS),
-    "100 Hz samples": (100, True, True, SEEDS),
-    "250 Hz means": (250, False, True, 1),
-    "500 Hz": (500, False, True, 1),
+    "100 Hz means": Rows(100),
+    "100 Hz means, direct": Rows(100, free=False),
+    "100 Hz samples": Rows(100, samples=True),
+    "250 Hz means": Rows(250, seeds=1),
+    "500 Hz": Rows(500, seeds=1),
+    "100 Hz means, 4 ms late": Rows(100, late=0.004),
+    "100 Hz means, 6 ms late": Rows(100, late=0.006),
+    "100 Hz means, 8 ms late": Rows(100, late=0.008),
+    "100 Hz means, 12 ms late": Rows(100, late=0.012),
 }
-"""Rate, whether samples, whether what is new in a row may act on its end, seeds."""
 TOLD = NAMES[:8]
 
 
@@ -87,43 +105,55 @@ def flown() -> tuple[list[tuple], tuple]:
     return cases, fly(truths, SECONDS)
 
 
+def logged(seen, motors, rows: Rows, vehicle) -> Track:
+    """The record of a flight whose every cycle is known, as rows tell it."""
+    cycles = round(rows.late / TICK)
+    motors = np.roll(motors, cycles, axis=0)
+    return record_of(
+        *rows_of(seen[cycles:], motors[cycles:], rows.rate, rows.samples),
+        rows.rate,
+        rows.samples,
+        vehicle,
+    )
+
+
 def study() -> list[dict]:
     """One row for each kind of rows, vehicle and strength of gusts."""
     nominal = vehicle_of(load_vehicle())
     cases, flights = flown()
     out = []
-    for kind, (rate, samples, free, seeds) in ROWS.items():
+    for kind, rows in ROWS.items():
         for name, gust in itertools.product(VEHICLES, GUSTS):
-            values = []
-            deviations = []
-            gains = []
-            for case, seen, motors in zip(cases, *flights, strict=True):
-                if case[:2] != (name, gust) or case[2] >= seeds:
-                    continue
-                rates, motor = rows_of(seen, motors, rate, samples)
-                record = record_of(rates, motor, rate, samples, nominal)
-                fit = fitted(record, free)
-                values.append(fit.value[:8])
-                deviations.append(np.sqrt(np.diag(fit.covariance))[:8])
-                if free:
-                    pair = responses([record], fit)["roll"]
-                    gains.append([list(pair.measured.at(f)) for f in (2.0, 5.0, 10.0)])
-            right = truth_of(truth := dataclasses.replace(VEHICLES[name], gust=gust))
-            inside = np.abs(np.array(values) - right) < 1.645 * np.array(deviations)
-            out.append(
-                {
-                    "rows": kind,
-                    "vehicle": name,
-                    "gust": truth.gust,
-                    "flights": len(values),
-                    "truth": dict(zip(TOLD, right.tolist(), strict=True)),
-                    "mean": dict(zip(TOLD, np.mean(values, 0).round(5).tolist(), strict=True)),
-                    "inside_90": dict(zip(TOLD, inside.mean(0).tolist(), strict=True)),
-                    "roll_at_2_5_10_hz": np.mean(gains, 0).round(1).tolist() if gains else None,
-                }
-            )
+            records = [
+                logged(seen, motors, rows, nominal)
+                for case, seen, motors in zip(cases, *flights, strict=True)
+                if case[:2] == (name, gust) and case[2] < rows.seeds
+            ]
+            fits = [fitted(record, rows.free) for record in records]
+            right = truth_of(VEHICLES[name])
+            right[2] -= rows.late
+            out.append({"rows": kind, "vehicle": name, "gust": gust} | told(fits, right))
+            if rows.free:
+                pairs = [responses([r], f)["roll"] for r, f in zip(records, fits, strict=True)]
+                points = [[p.measured.at(f) for f in (2.0, 5.0, 10.0)] for p in pairs]
+                out[-1]["roll_at_2_5_10_hz"] = np.mean(points, 0).round(1).tolist()
             print(kind, name, gust, out[-1]["mean"], flush=True)
     return out
+
+
+def told(fits: list[TorqueFit], right: np.ndarray) -> dict:
+    """The mean of several fits beside what is right (8,), and how often their intervals
+    hold it.
+    """
+    values = np.array([f.value[:8] for f in fits])
+    deviations = np.array([np.sqrt(np.diag(f.covariance))[:8] for f in fits])
+    inside = np.abs(values - right) < 1.645 * deviations
+    return {
+        "flights": len(fits),
+        "truth": dict(zip(TOLD, right.tolist(), strict=True)),
+        "mean": dict(zip(TOLD, values.mean(0).round(5).tolist(), strict=True)),
+        "inside_90": dict(zip(TOLD, inside.mean(0).tolist(), strict=True)),
+    }
 
 
 def summary(rows: list[dict]) -> dict:
