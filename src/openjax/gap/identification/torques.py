@@ -29,7 +29,8 @@ def identify_torques(records: list[Track], one_clock: bool = True) -> TorqueFit:
         if _best(base, others).loss < _best(base, fits).loss - CLEARLY:
             base, fits = low_pass_problem, others
     first = _best(base, fits)
-    if not one_clock or (_clear(first) and not all(_begins(base, *f) for f in fits.items())):
+    is_late = all(_begins(base, rows, fit) for rows, fit in fits.items())
+    if not one_clock or (_clear(first) and not is_late):
         return first
     late = search(base, begin(base, LATE[1]))
     fits[0] = min(fits[0], late, key=lambda f: f.loss)
@@ -62,7 +63,7 @@ def _best(base: Problem, fits: dict[int, TorqueFit]) -> TorqueFit:
     """The likeliest of those that don't end at the beginning of their search, if there are
     such: what rows hide counts for motors that act before they are logged.
     """
-    return min(fits.items(), key=lambda item: (_begins(base, *item), item[1].loss))[1]
+    return fits[min(fits, key=lambda rows: (_begins(base, rows, fits[rows]), fits[rows].loss))]
 
 
 def _begins(base: Problem, rows: int, fit: TorqueFit) -> bool:
