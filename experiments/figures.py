@@ -1,9 +1,9 @@
-"""Figures that several pages show, each from one stored result: `python -m
-experiments.figures` writes them.
+"""Figures that several pages show, each from one stored result: `python -m experiments.figures`
+writes them.
 
-A page has a block between `<!-- NAME -->` and `<!-- end of NAME -->`; `BLOCKS` has its
-text, computed from `experiments/results/*.json`. `tests/test_readme_numbers.py` fails
-while a page shows anything else.
+A page has a block between `<!-- NAME -->` and `<!-- end of NAME -->`; `BLOCKS` has its text,
+computed from `experiments/results/*.json`. `tests/test_readme_numbers.py` fails while a page shows
+anything else.
 """
 
 import textwrap
@@ -106,8 +106,8 @@ def hold() -> str:
 
 
 def paper_game() -> tuple[list[str], list[str]]:
-    """Rows on `open` in the paper's game: captures of the worst layout, and steps to the
-    capture beside the paper's.
+    """Rows on `open` in the paper's game: captures of the worst layout, and steps to the capture
+    beside the paper's.
     """
     seeds = read("headline")["records"]["clamp, drawn starts"].values()
     flown = {
@@ -171,8 +171,8 @@ def slower_vehicle() -> list[str]:
 
 
 def forced() -> list[str]:
-    """Captures of `teams` where a theorem forces points to catch, at reaches at which no
-    planner dodges.
+    """Captures of `teams` where a theorem forces points to catch, at reaches at which no planner
+    dodges.
     """
     squares = [
         square["learned"]["capture_rate"]

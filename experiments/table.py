@@ -42,8 +42,8 @@ MARKS = ("<!-- table -->", "<!-- end of table -->")
 """Between them stands a page's table, which a program makes."""
 
 Column = str | Callable[[Mapping], Any]
-"""Of a record: a path through it with a format, `summary.capture_rate:.3f`, or what is
-computed from it.
+"""Of a record: a path through it with a format, `summary.capture_rate:.3f`, or what is computed
+from it.
 """
 
 
@@ -51,8 +51,8 @@ computed from it.
 class Table:
     """Records, one a row, and by the head of each column what it shows of them.
 
-    A list of numbers is shown as mean (standard deviation), a truth as yes or no, and
-    what is missing, None or no number as a dash.
+    A list of numbers is shown as mean (standard deviation), a truth as yes or no, and what is
+    missing, None or no number as a dash.
     """
 
     columns: Mapping[str, Column]
@@ -166,8 +166,8 @@ def typed_command() -> str:
 
 
 def facts(commit: str | None = None) -> dict:
-    """What stands beside all results: the command, the machine, and the commit, where
-    the source tree can't tell.
+    """What stands beside all results: the command, the machine, and the commit, where the source
+    tree can't tell.
     """
     machine = describe_machine()
     return {"command": typed_command(), "machine": machine | ({"commit": commit} if commit else {})}
@@ -179,8 +179,8 @@ def publish(
     page: Callable[[Any], Page],
     draw: Callable[[Any, Path], None] | None = None,
 ) -> None:
-    """Store what `study` finds (unless told to read it), print the report made from
-    what is stored, and write its page.
+    """Store what `study` finds (unless told to read it), print the report made from what is stored,
+    and write its page.
 
     Command, machine and seconds stand beside it; `draw` draws the page's figure.
     """

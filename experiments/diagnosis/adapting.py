@@ -1,17 +1,17 @@
-"""How far does the gap shrink in the task? What training in the corrected simulator
-wins back of what training in the true one would, and what a wrong name wins or costs.
+"""How far does the gap shrink in the task? What training in the corrected simulator wins back of
+what training in the true one would, and what a wrong name wins or costs.
 
     python -m experiments.diagnosis.adapting diagnose --work DIR --jobs 16
     python -m experiments.diagnosis.adapting tune --work DIR --part 0 2 --out part_0.json   (a GPU)
     python -m experiments.diagnosis.adapting report part_0.json part_1.json --out adapting.json
 
-A vehicle is openjax' own with one effect of 1.5 times its sample strength. `diagnose`
-flies it through six segments in uneven air, with sensors of a laboratory, and diagnoses
-these flights twice: as they are, and with a library that lacks the cause and what would
-do as well by the first report, so that only a wrong name can be given. `tune` flies a
-policy with the true vehicle and with the nominal one. Where the vehicle costs something
-beyond chance it is fine-tuned as `openjax adapt` does, to the true effect, to what was
-found, and to the wrong name; all of them fly the same tasks with the true one.
+A vehicle is openjax' own with one effect of 1.5 times its sample strength. `diagnose` flies it
+through six segments in uneven air, with sensors of a laboratory, and diagnoses these flights twice:
+as they are, and with a library that lacks the cause and what would do as well by the first report,
+so that only a wrong name can be given. `tune` flies a policy with the true vehicle and with the
+nominal one. Where the vehicle costs something beyond chance it is fine-tuned as `openjax adapt`
+does, to the true effect, to what was found, and to the wrong name; all of them fly the same tasks
+with the true one.
 """
 
 import argparse
@@ -203,16 +203,16 @@ def adapted(tuner: Tuner, folder: Path) -> dict:
 
 
 def won(flown: dict, name: str) -> dict:
-    """Mean and covariance of the mean of what each training wins by the same episodes,
-    true, found, wrong.
+    """Mean and covariance of the mean of what each training wins by the same episodes, true, found,
+    wrong.
     """
     gains = np.array([flown["before"][name] - flown[w][name] for w in TUNED], float)
     return {"mean": gains.mean(1).tolist(), "cov": (np.cov(gains) / gains.shape[1]).tolist()}
 
 
 def shares(vehicles: list[dict], name: str) -> dict:
-    """Of what true training wins over all vehicles that lose by a figure, the share
-    that the found and the wrong name win, with a 90 % interval by the delta method.
+    """Of what true training wins over all vehicles that lose by a figure, the share that the found
+    and the wrong name win, with a 90 % interval by the delta method.
     """
     rows = [v["won"][name] for v in vehicles if name in v["loses"]]
     if not rows:

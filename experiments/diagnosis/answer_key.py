@@ -1,5 +1,5 @@
-"""The answer key: what the logs of a case can show, and so what is asked of a
-diagnosis. Rules: README.md.
+"""The answer key: what the logs of a case can show, and so what is asked of a diagnosis. Rules:
+README.md.
 """
 
 import functools
@@ -16,8 +16,8 @@ FORCE, TORQUE, YAW = slice(0, 3), slice(3, 5), 5
 
 
 def floors(fleet, i, turbulence):
-    """Noise floor (12,) of a case from the logs of variant i and what turbulence leaves
-    to the true model.
+    """Noise floor (12,) of a case from the logs of variant i and what turbulence leaves to the true
+    model.
     """
     spec = fleet.variants[i][0]
     rows = [r for flight in fleet.rows(i)[0] for r in flight]
@@ -36,8 +36,8 @@ def floors(fleet, i, turbulence):
 
 
 def answer_of(fleet, i, squares, floor, wrong):
-    """The answer of variant i: what was put in, what of it shows, which names are
-    right; `wrong`: spoiled columns.
+    """The answer of variant i: what was put in, what of it shows, which names are right; `wrong`:
+    spoiled columns.
     """
     spec, own = fleet.variants[i]
     known = np.isfinite(floor)
@@ -114,8 +114,8 @@ def answer_of(fleet, i, squares, floor, wrong):
 
 
 def scale_stands_in(fleet, i, name, squares, floor):
-    """Whether one constant factor on the thrust leaves less than `HIDDEN` floors of a
-    cause in the map to thrust.
+    """Whether one constant factor on the thrust leaves less than `HIDDEN` floors of a cause in the
+    map to thrust.
     """
     if name not in ("battery_sag", "thrust_curve"):
         return False

@@ -13,8 +13,8 @@ DT = 0.001
 
 
 class Body:
-    """Rotors, forces and the rigid body of a batch; state position, velocity, rates (3,
-    B), q, rotor (4, B).
+    """Rotors, forces and the rigid body of a batch; state position, velocity, rates (3, B), q,
+    rotor (4, B).
     """
 
     def __init__(self, p, neutral, position, velocity, q, rates, rotor):
@@ -43,8 +43,8 @@ class Body:
     def step(
         self, m, voltage, load, gust_force, gust_torque, slow, others=(), unknowns=None, time=0.0
     ):
-        """One millisecond under motor commands m (4, B); `others` are positions (3, B)
-        of vehicles that may fly above.
+        """One millisecond under motor commands m (4, B); `others` are positions (3, B) of vehicles
+        that may fly above.
         """
         p = self.p
         zero = self.zero
@@ -121,8 +121,8 @@ class Body:
 
 
 class Battery:
-    """Voltage (B,) V: open-circuit voltage falls with the charge used, the terminals
-    sag with the current.
+    """Voltage (B,) V: open-circuit voltage falls with the charge used, the terminals sag with the
+    current.
     """
 
     def __init__(self, air, hover):

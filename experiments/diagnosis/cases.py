@@ -1,10 +1,9 @@
-"""Which cases are drawn. Everything follows from the seed, the column (`known` or
-`stranger`) and the case's number.
+"""Which cases are drawn. Everything follows from the seed, the column (`known` or `stranger`) and
+the case's number.
 
-The known column may be used for development at will, and the real one, the same on
-vehicles with the errors of form that real ones have. The stranger's column draws
-sensors, a controller, vehicles, unknown kinds and garbage that the others never draw;
-it is for reported runs only.
+The known column may be used for development at will, and the real one, the same on vehicles with
+the errors of form that real ones have. The stranger's column draws sensors, a controller, vehicles,
+unknown kinds and garbage that the others never draw; it is for reported runs only.
 """
 
 from dataclasses import replace
@@ -81,8 +80,8 @@ def _target(rng, band):
 
 
 def draw_missions(rng, needed, style, two):
-    """Three flights, each a mission or a pair of them; what is needed is flown twice if
-    there is room.
+    """Three flights, each a mission or a pair of them; what is needed is flown twice if there is
+    room.
     """
     flights = [str(rng.choice(options)) for options in needed * 2 if options][:3]
     while len(flights) < 3:
@@ -99,8 +98,8 @@ def _kinds(column, known, strangers):
 
 
 def draw_case(seed, column, number, category, index):
-    """One case as a dict of plain values; `index` counts within the category, so that
-    kinds come in turn.
+    """One case as a dict of plain values; `index` counts within the category, so that kinds come in
+    turn.
     """
     rng = case_rng(seed, column, number)
     told = vehicle.draw_told(rng)
@@ -185,8 +184,8 @@ def draw_case(seed, column, number, category, index):
 
 
 def draw_cases(seed, column, count, only=None):
-    """A list of `count` cases in shuffled order, categories in the shares of `SHARES`
-    (or those named in `only`).
+    """A list of `count` cases in shuffled order, categories in the shares of `SHARES` (or those
+    named in `only`).
     """
     shares = {k: w for k, w in SHARES.items() if not only or k in only}
     total = sum(shares.values())

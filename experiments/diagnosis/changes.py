@@ -1,14 +1,14 @@
-"""What changed, where the answer is known: sample flights with a known effect, and real
-flights of two Crazyflies.
+"""What changed, where the answer is known: sample flights with a known effect, and real flights of
+two Crazyflies.
 
     python -m experiments.diagnosis.changes --work DIR --seeds 11 12 13 --vehicles E8=FOLDER
     E9=FOLDER=ANSWERS.json
 
-Sample flights of each effect, and of none, are diagnosed with those of none flown with
-another seed as the reference. A vehicle is a folder of conditions with `labels.json` (or a file of
-answers) and its normal flights in `normal_flight` or `reference`. These two are of
-CrazyPAD (github.com/AerialRoboticsUUST/CrazyPAD, commit 5448265, MIT; Masalimov et al.,
-Data 2024, 9(6), 79): no orientation, so trims alone are compared. Every condition is compared with all normal
+Sample flights of each effect, and of none, are diagnosed with those of none flown with another seed
+as the reference. A vehicle is a folder of conditions with `labels.json` (or a file of answers) and
+its normal flights in `normal_flight` or `reference`. These two are of CrazyPAD
+(github.com/AerialRoboticsUUST/CrazyPAD, commit 5448265, MIT; Masalimov et al., Data 2024, 9(6),
+79): no orientation, so trims alone are compared. Every condition is compared with all normal
 flights, and each day of normal flights with the others. `--figure` draws the figure of
 docs/what_changed.md into `--work` instead.
 """
@@ -152,8 +152,8 @@ def page(results: dict) -> Page:
 
 
 def figure(folder: Path) -> None:
-    """Two normal days, whose rotors differ by 2 % as new propellers do, and one with a
-    weaker rotor.
+    """Two normal days, whose rotors differ by 2 % as new propellers do, and one with a weaker
+    rotor.
     """
     vehicle = load_vehicle()
     rng = np.random.default_rng(3)

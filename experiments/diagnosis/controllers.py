@@ -1,10 +1,10 @@
-"""Three off-board controllers that turn a reference and a measured pose into collective
-thrust and body rates.
+"""Three off-board controllers that turn a reference and a measured pose into collective thrust and
+body rates.
 
-`geometric` aligns the thrust with the wanted acceleration; `cascade` is a chain of PIDs
-on position, velocity and Euler angles, as firmware position controllers are; `preview`
-(stranger's column only) tracks a point ahead, every 20 ms, with smoothed commands. All
-see the told mass and thrust constant.
+`geometric` aligns the thrust with the wanted acceleration; `cascade` is a chain of PIDs on
+position, velocity and Euler angles, as firmware position controllers are; `preview` (stranger's
+column only) tracks a point ahead, every 20 ms, with smoothed commands. All see the told mass and
+thrust constant.
 """
 
 import numpy as np
@@ -18,8 +18,8 @@ AHEAD = 8  # ticks that `preview` looks ahead
 
 
 class Controllers:
-    """The controllers of a batch: `kind` names one per body, `mass` (B,) kg and `most`
-    (B,) N of all four rotors.
+    """The controllers of a batch: `kind` names one per body, `mass` (B,) kg and `most` (B,) N of
+    all four rotors.
     """
 
     def __init__(self, kinds, mass, most, reference):
@@ -33,8 +33,8 @@ class Controllers:
         self.command = None
 
     def __call__(self, k, position, q, velocity):
-        """Commands (4, B) at tick k: thrust 0..1 and body rates rad/s; held where the
-        controller is not due.
+        """Commands (4, B) at tick k: thrust 0..1 and body rates rad/s; held where the controller is
+        not due.
         """
         r = self.reference
         last = len(self.reference["position"]) - 1

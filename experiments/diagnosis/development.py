@@ -1,14 +1,13 @@
-"""Diagnose sets of cases with known answers, in parallel processes: one JSON line a
-case, and one table.
+"""Diagnose sets of cases with known answers, in parallel processes: one JSON line a case, and one
+table.
 
     python -m experiments.diagnosis.development --sets DIR DIR=ANSWERS.json … --out cases.jsonl
     python -m experiments.diagnosis.development --report cases.jsonl …
 
 A set is a folder of cases (folders of logs with a vehicle.toml); its answers lie in
-DIR/answers.json, in DIR_answers.json beside it or are named. Lines are written as cases
-end, so that a run which is cut short still counts; cases in the file already aren't
-done again. `--engine-options` is a JSON object handed to
-`openjax.gap.diagnosis.diagnose_case`.
+DIR/answers.json, in DIR_answers.json beside it or are named. Lines are written as cases end, so
+that a run which is cut short still counts; cases in the file already aren't done again.
+`--engine-options` is a JSON object handed to `openjax.gap.diagnosis.diagnose_case`.
 """
 
 import argparse
@@ -38,9 +37,7 @@ def answers_of(folder: Path) -> Path | None:
 
 
 def find_jobs(sets: list[str], options: dict) -> list[tuple]:
-    """(set, folder, answer, options) of every case, sets interleaved in a fixed random
-    order.
-    """
+    """(set, folder, answer, options) of every case, sets interleaved in a fixed random order."""
     jobs = []
     for entry in sets:
         place, _, named = entry.partition("=")
@@ -76,9 +73,8 @@ def diagnose(job: tuple) -> dict:
             report = made.to_dict()
             broken = broken_rules(made)
         except UserError as refusal:
-            error = str(refusal).replace(f"{folder.parent}/", "")[
-                :500
-            ]  # a case, not a place of this machine
+            # a case, not a place of this machine
+            error = str(refusal).replace(f"{folder.parent}/", "")[:500]
     except Exception:  # a traceback is a finding, not the end
         trace = traceback.format_exc()[-2000:]
     seconds = round(time.perf_counter() - start, 2)
@@ -92,17 +88,8 @@ def diagnose(job: tuple) -> dict:
     line |= {"severity": answer.get("severity"), "magnitudes": parameters(answer, report)}
     line |= {"broken_rules": broken}
     line |= {"seconds": seconds, "first": _done == 1, "error": error, "traceback": trace}
-    fields = (
-        "probabilities",
-        "shares",
-        "parameters",
-        "gap",
-        "not_testable",
-        "rest",
-        "quality",
-        "residual",
-        "residual_before",
-    )
+    fields = ("probabilities", "shares", "parameters", "gap", "not_testable", "rest", "quality")
+    fields += ("residual", "residual_before")
     return line | {k: report[k] for k in fields if report and k in report}
 
 

@@ -1,5 +1,5 @@
-"""The vocabulary of the exam: twenty effects, the forms and sizes that they are drawn
-in, and which of them can stand in for one another.
+"""The vocabulary of the exam: twenty effects, the forms and sizes that they are drawn in, and which
+of them can stand in for one another.
 
 How an effect acts is in `forces`, how a drawn cause gets into the plant's parameters in
 `injection`.
@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 
 class Drawn(NamedTuple):
-    """What is drawn of an effect: (smallest, largest) size, forms, missions that expose
-    it, logged channels that it needs.
+    """What is drawn of an effect: (smallest, largest) size, forms, missions that expose it, logged
+    channels that it needs.
     """
 
     sizes: tuple
@@ -83,9 +83,7 @@ PARTS = {
 
 
 def draw(rng, effect, form=None):
-    """A cause of the effect; the size lies within its usual range, the form is drawn
-    unless given.
-    """
+    """A cause of the effect; the size lies within its usual range, the form is drawn unless given."""
     (low, high), forms = EFFECTS[effect].sizes, EFFECTS[effect].forms
     form = str(rng.choice(forms)) if form is None else form
     size = low * (high / low) ** rng.uniform()

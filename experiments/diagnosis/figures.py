@@ -1,5 +1,5 @@
-"""Figures of diagnosed cases, as `development` writes them: counts, calibration, bounds
-of the shares, seconds.
+"""Figures of diagnosed cases, as `development` writes them: counts, calibration, bounds of the
+shares, seconds.
 """
 
 import math
@@ -42,8 +42,8 @@ def calibration_error(pairs: list, bins: int = 10) -> float:
 
 
 def shares_in_bounds(shares: dict) -> bool:
-    """Whether effects, sensors and unexplained add up to 1, each within -.2 to 1.2,
-    with intervals in order.
+    """Whether effects, sensors and unexplained add up to 1, each within -.2 to 1.2, with intervals
+    in order.
     """
     parts = [*shares["effects"].values(), shares["sensors"], shares["unexplained"]]
     values = [p["value"] for p in parts]

@@ -12,8 +12,8 @@ SAMPLE = 0.002
 
 
 class Filter:
-    """Second-order Butterworth low-pass of (n, B) signals at 500 Hz; `cut` (B,) Hz, 0
-    lets everything through.
+    """Second-order Butterworth low-pass of (n, B) signals at 500 Hz; `cut` (B,) Hz, 0 lets
+    everything through.
     """
 
     def __init__(self, cut, rows, start):
@@ -38,8 +38,8 @@ class Filter:
 
 
 class Firmware:
-    """Rate loop of the firmware at 500 Hz: filters of gyroscope and derivative, PID in
-    counts, mixer.
+    """Rate loop of the firmware at 500 Hz: filters of gyroscope and derivative, PID in counts,
+    mixer.
     """
 
     def __init__(self, p, gyro, integral=None):
@@ -56,9 +56,7 @@ class Firmware:
         self.previous, self.slope = gyro.copy(), np.zeros((3, count))
 
     def __call__(self, command, gyro):
-        """Motor commands (4, B) from the command in force (4, B) and the filtered
-        gyroscope (3, B).
-        """
+        """Motor commands (4, B) from the command in force (4, B) and the filtered gyroscope (3, B)."""
         p = self.p
         error = np.rad2deg(command[1:] - gyro)
         self.integral = np.minimum(

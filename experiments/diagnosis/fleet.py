@@ -1,5 +1,5 @@
-"""Cases in the air and on disk: many variants of them flown as one batch, measured, and
-their logs written.
+"""Cases in the air and on disk: many variants of them flown as one batch, measured, and their logs
+written.
 """
 
 import gzip
@@ -45,8 +45,8 @@ class Fleet:
     """Bodies of several variants of several cases, flown as one batch."""
 
     def __init__(self, seed, column, variants, drawn, wakes_from=None):
-        """variants: list of (spec, causes); drawn: {case name: `bodies`}; `wakes_from`
-        as in `plant.Batch`.
+        """variants: list of (spec, causes); drawn: {case name: `bodies`}; `wakes_from` as in
+        `plant.Batch`.
         """
         self.seed = seed
         self.column = column
@@ -116,8 +116,8 @@ class Fleet:
         return np.stack([(rms[:, c] ** 2).mean(axis=1) for c in self.columns], axis=1)
 
     def replayed(self, i, parameters, motors=None, lasts=None):
-        """Mean squares (12,) of a model on variant i alone, driven by other motor
-        commands (S, 4, n) than it got, if given; `lasts` (n,): samples of them.
+        """Mean squares (12,) of a model on variant i alone, driven by other motor commands (S, 4,
+        n) than it got, if given; `lasts` (n,): samples of them.
         """
         c = self.columns[i]
         no = np.zeros(len(self.columns[i]), bool)
@@ -129,8 +129,8 @@ class Fleet:
         return (measure.errors(flown, told, own, self.partner[c] - c[0], no, no) ** 2).mean(axis=1)
 
     def energies(self):
-        """{model: mean squares (12, variants)}: the nominal model, the true one, and
-        that without its first or second cause.
+        """{model: mean squares (12, variants)}: the nominal model, the true one, and that without
+        its first or second cause.
         """
         flew = [own for _, own in self.variants]
         out = {"nominal": self.errors([[] for _ in flew]), "truth": self.errors(flew)}
@@ -148,8 +148,8 @@ class Fleet:
         return real.as_logged(spec.get("form_errors"), spec["told"], rows)
 
     def rows(self, i, spoiled=False):
-        """The log of variant i: list over flights of lists over vehicles of {column:
-        (n,)}, and the rows that are wrong.
+        """The log of variant i: list over flights of lists over vehicles of {column: (n,)}, and the
+        rows that are wrong.
         """
         spec, causes = self.variants[i]
         rng = cases.case_rng(self.seed, self.column, spec["number"], 3)
@@ -197,8 +197,8 @@ def write_logs(folder, flights, channels, vehicle_file):
 
 
 def write_case(fleet, i, folder, spoiled=False):
-    """Write the logs and `vehicle.toml` of variant i into `folder`; returns the columns
-    that were spoiled.
+    """Write the logs and `vehicle.toml` of variant i into `folder`; returns the columns that were
+    spoiled.
     """
     spec, (rows, wrong) = fleet.variants[i][0], fleet.rows(i, spoiled)
     errors = spec.get("form_errors")

@@ -1,8 +1,8 @@
-"""How the effects act inside the plant: motors' demand, thrust near surfaces, wakes,
-and the forces of the air.
+"""How the effects act inside the plant: motors' demand, thrust near surfaces, wakes, and the forces
+of the air.
 
-What acts is decided by the plant's parameters alone (`vehicle.nominal_parameters`, with
-causes written in by `injection`). Arrays have the body index last.
+What acts is decided by the plant's parameters alone (`vehicle.nominal_parameters`, with causes
+written in by `injection`). Arrays have the body index last.
 """
 
 import numpy as np
@@ -30,8 +30,8 @@ class Active:
 
 
 def motor_demand(p, active, m, voltage, load):
-    """Motor commands (4, B) to effective thrust fraction: thrust map, battery,
-    saturation, in this order.
+    """Motor commands (4, B) to effective thrust fraction: thrust map, battery, saturation, in this
+    order.
     """
     u = m
     hover = p["hover"]
@@ -81,8 +81,8 @@ def surface_gain(p, active, position, q):
 
 
 def wake_force(p, position, other):
-    """Vertical force (B,) N, negative, from the rotor wake of the vehicle at `other`
-    (3, B), and its gradient (2, B) N/m.
+    """Vertical force (B,) N, negative, from the rotor wake of the vehicle at `other` (3, B), and
+    its gradient (2, B) N/m.
     """
     dx = position[0] - other[0]
     dy = position[1] - other[1]
@@ -104,8 +104,8 @@ def wake_force(p, position, other):
 
 
 def air_forces(p, active, q, velocity, rates, speed, thrust, position, gust):
-    """Force (3, B) N and torque (3, B) N m in the body frame from drag, flapping and
-    wind; `thrust`, `speed` (4, B).
+    """Force (3, B) N and torque (3, B) N m in the body frame from drag, flapping and wind;
+    `thrust`, `speed` (4, B).
     """
     vb = rotate_back(q, velocity)
     force = np.zeros_like(vb)
@@ -149,8 +149,8 @@ def air_forces(p, active, q, velocity, rates, speed, thrust, position, gust):
 
 
 def seen_by_accelerometer(p, specific, rates):
-    """Specific force (3, B) where the accelerometer sits, if that isn't the centre of
-    mass (centripetal part).
+    """Specific force (3, B) where the accelerometer sits, if that isn't the centre of mass
+    (centripetal part).
     """
     lever = -p["com"] * p["imu_lever"]
     return specific + cross(rates, cross(rates, lever))

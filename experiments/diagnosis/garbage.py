@@ -1,5 +1,5 @@
-"""Logs that contradict themselves: what people really hand in. Each takes the rows of a
-case's flights and spoils them.
+"""Logs that contradict themselves: what people really hand in. Each takes the rows of a case's
+flights and spoils them.
 
 `KINDS` may be used for development; `STRANGERS` appear in reported runs only.
 """
@@ -37,8 +37,8 @@ STRANGERS = {
 
 
 def spoil(kind, flights, rng):
-    """Spoil `flights` (list of {column: (n,)} of one vehicle) in place; returns the
-    columns that are wrong.
+    """Spoil `flights` (list of {column: (n,)} of one vehicle) in place; returns the columns that
+    are wrong.
     """
     a, b, _ = rng.permutation(3)
     order = rng.permutation(4)

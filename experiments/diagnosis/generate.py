@@ -4,9 +4,8 @@
     OUT/answers.json [--jobs 8] [--column stranger] [--only single,none]
     [--healthy]
 
-Prints the SHA-256 of the answers. In one pass a case is flown with four sizes of its
-cause; the one whose gap, by the plant's own measure, comes nearest to the severity
-drawn is kept.
+Prints the SHA-256 of the answers. In one pass a case is flown with four sizes of its cause; the one
+whose gap, by the plant's own measure, comes nearest to the severity drawn is kept.
 """
 
 import argparse
@@ -121,9 +120,7 @@ def fly_chunk(job):
 
 
 def in_processes(do, work, jobs):
-    """`do` of each piece of work by so many processes, as they come; one is this
-    one.
-    """
+    """`do` of each piece of work by so many processes, as they come; one is this one."""
     if jobs == 1:
         yield from map(do, work)
     else:
@@ -132,8 +129,8 @@ def in_processes(do, work, jobs):
 
 
 def generate(seed, column, count, logs, jobs=1, only=None, healthy=False):
-    """All cases, and their reference flights if they are to be `healthy`; writes the
-    logs and returns the answers, sorted by case.
+    """All cases, and their reference flights if they are to be `healthy`; writes the logs and
+    returns the answers, sorted by case.
     """
     specs = cases.draw_cases(seed, column, count, only)
     size = max(1, min(CHUNK, math.ceil(len(specs) / jobs)))

@@ -36,8 +36,8 @@ def day_of(seed, column, spec, folder):
 
 
 def write_healthy(seed, column, specs, folder):
-    """Fly and write the reference flights of the cases `specs`, whose logs lie in
-    `folder`, into the folder beside it that `healthy_beside` names.
+    """Fly and write the reference flights of the cases `specs`, whose logs lie in `folder`, into
+    the folder beside it that `healthy_beside` names.
     """
     days = [day_of(seed, column, spec, 0) for spec in specs]
     fleet = Fleet(

@@ -32,8 +32,8 @@ class Cause(NamedTuple):
 
 
 def inject(cause, p, c, arrival=None, rng=None):
-    """Write the cause into the parameters of the bodies `c`; the link's effects change
-    `arrival` (K, B), in ms, by draws of `rng`.
+    """Write the cause into the parameters of the bodies `c`; the link's effects change `arrival`
+    (K, B), in ms, by draws of `rng`.
 
     Returns the magnitudes of the effect.
     """
@@ -79,9 +79,7 @@ def battery_sag(cause, p, c):
 
 
 def thrust_saturation(cause, p, c):
-    """A ceiling of the demand; the size is how much of the room between hover and .92
-    is missing.
-    """
+    """A ceiling of the demand; the size is how much of the room between hover and .92 is missing."""
     top = 0.92 - cause.size * (0.88 - p["hover"][c])
     p["limit"][c] = top
     p["limit_voltage"][c] = 0.25 if cause.form == "voltage" else 0.0
@@ -134,8 +132,8 @@ def rotor_drag(cause, p, c):
 
 
 def blade_flapping(cause, p, c):
-    """The size is the torque at hover thrust in 1e-4 N m per m/s; the thrust leans by
-    .004 to .03 rad per m/s.
+    """The size is the torque at hover thrust in 1e-4 N m per m/s; the thrust leans by .004 to .03
+    rad per m/s.
     """
     p["flap_torque"][c] = 1e-4 * cause.size
     p["flap_tilt"][c] = (0.004 + 0.02 * cause.shape[1]) * min(cause.size, 1.3)
@@ -310,8 +308,8 @@ def packet_loss(cause, arrival, c, rng):
 
 
 def bursts(share, draws):
-    """Which packets a Gilbert-Elliott link loses, from two uniform draws a packet: bad
-    spells last some 5 packets, in which nearly all are lost.
+    """Which packets a Gilbert-Elliott link loses, from two uniform draws a packet: bad spells last
+    some 5 packets, in which nearly all are lost.
     """
     stay = 0.8
     enter = (1 - stay) * share / max(0.95 - share, 0.05)

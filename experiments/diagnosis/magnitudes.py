@@ -1,5 +1,5 @@
-"""How far the parameters of a report are from the answer's, and whether their intervals
-hold the truth.
+"""How far the parameters of a report are from the answer's, and whether their intervals hold the
+truth.
 
 What is read of `report.json`: `parameters` {effect: {name: {value, interval90}}}.
 """

@@ -33,8 +33,8 @@ THRUST_ALLOWANCE = 0.008  # of the thrust, free in every hypothesis
 def errors(flown, told, parameters, partner, other_firmware, links):
     """Root-mean-square errors (12, B) of the model `parameters`.
 
-    `other_firmware` (B,): the model's commands, gains or filters differ from those that
-    flew; `links` (B,): it knows which commands arrived.
+    `other_firmware` (B,): the model's commands, gains or filters differ from those that flew;
+    `links` (B,): it knows which commands arrived.
     """
     samples, _, count = flown["position"].shape
     neutral = v.nominal_parameters(told)
@@ -147,8 +147,8 @@ def _motor_errors(flown, parameters, other_firmware, links):
 
 
 def motors_of_log(rows, samples):
-    """Motor commands every 2 ms as a reader of the log can have them, (2, S, 4): held
-    over a row, straight between rows.
+    """Motor commands every 2 ms as a reader of the log can have them, (2, S, 4): held over a row,
+    straight between rows.
     """
     times = SAMPLE * np.arange(samples)
     logged = np.stack([rows[c] for c in GROUPS["m"]], axis=1)
@@ -157,8 +157,8 @@ def motors_of_log(rows, samples):
 
 
 def sensor_floor(sensors, rows, flown, j):
-    """(12,) what the case's sensors add to the errors of body j, over the same
-    horizons; inf where nothing was logged.
+    """(12,) what the case's sensors add to the errors of body j, over the same horizons; inf where
+    nothing was logged.
     """
     have = sensors["channels"]
     t = rows["t"]

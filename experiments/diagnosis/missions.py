@@ -44,8 +44,8 @@ def _curve(rng, t, speed, radius):
 
 
 def _doublets(rng, length, rate, axes, size):
-    """Short alternating pulses (K, 4) on [thrust, wx, wy, wz]; they excite what
-    tracking alone does not.
+    """Short alternating pulses (K, 4) on [thrust, wx, wy, wz]; they excite what tracking alone does
+    not.
     """
     pulses = np.zeros((length, 4))
     start = 100
@@ -60,16 +60,16 @@ def _doublets(rng, length, rate, axes, size):
 
 
 def _dither(rng, length):
-    """Pseudo-random body-rate commands (K, 4) on top of tracking: a broad excitation,
-    as identification flights have.
+    """Pseudo-random body-rate commands (K, 4) on top of tracking: a broad excitation, as
+    identification flights have.
     """
     held = _held(rng, rng.choice([-1.0, 0.0, 1.0], (length, 3)), length, (0.04, 0.16))
     return np.concatenate([np.zeros((length, 1)), rng.uniform(0.2, 0.7) * held], axis=1)
 
 
 def single(kind, rng, length):
-    """One vehicle's reference: position (K, 3) m, velocity, acceleration, yaw (K,) rad,
-    yaw rate, pulses (K, 4).
+    """One vehicle's reference: position (K, 3) m, velocity, acceleration, yaw (K,) rad, yaw rate,
+    pulses (K, 4).
     """
     t = np.arange(length) / RATE
     position = np.zeros((length, 3))
@@ -172,8 +172,8 @@ def apart(reference, side):
 
 
 def pair(kind, rng, length):
-    """Two vehicles' references; the second passes above the first, so that the first is
-    in its wake now and then.
+    """Two vehicles' references; the second passes above the first, so that the first is in its wake
+    now and then.
     """
     t = np.arange(length) / RATE
     lower = np.tile(np.r_[rng.uniform(-0.1, 0.1, 2), rng.uniform(0.3, 0.45)], (length, 1))

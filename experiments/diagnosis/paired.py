@@ -1,14 +1,12 @@
-"""The same cases by several engines: figures of each, and whether they differ, case by
-case.
+"""The same cases by several engines: figures of each, and whether they differ, case by case.
 
     python -m experiments.diagnosis.paired --seeds 2301 2302 2303 --count 120 --cores 64
     --engines now=src before=FOLDER/src --work DIR --out FILE.json [--healthy] [--sets DIR ...]
 
-Cases of one column are flown anew from the seeds, beside the sets that are given. An
-engine is a folder that holds the package `openjax`; `NAME=FOLDER+reference` gives it
-the flights of the same vehicle while nothing was wrong with it, flown with `--healthy`.
-Differences of two engines are tested by McNemar's exact test on the cases that only one
-of them has right.
+Cases of one column are flown anew from the seeds, beside the sets that are given. An engine is a
+folder that holds the package `openjax`; `NAME=FOLDER+reference` gives it the flights of the same
+vehicle while nothing was wrong with it, flown with `--healthy`. Differences of two engines are
+tested by McNemar's exact test on the cases that only one of them has right.
 """
 
 import argparse
@@ -26,9 +24,7 @@ from experiments.diagnosis.run import ROOT, stored_figures
 
 
 def fly(seed: int, options) -> tuple[Path, str]:
-    """Fly the cases of a seed in a process of its own; their folder, the SHA-256 of the
-    answers.
-    """
+    """Fly the cases of a seed in a process of its own; their folder, the SHA-256 of the answers."""
     logs = options.work / f"{options.column}_{seed}"
     answers = logs.with_name(logs.name + "_answers.json")
     if not answers.exists():
@@ -57,9 +53,7 @@ def diagnose(name: str, engine: str, sets: list[str], options) -> list[dict]:
 
 
 def mcnemar(one: list[dict], other: list[dict]) -> dict[str, dict]:
-    """{figure: cases that only one engine has right, and the exact two-sided
-    p-value}.
-    """
+    """{figure: cases that only one engine has right, and the exact two-sided p-value}."""
     second = {(r["set"], r["case"]): r for r in other}
     both = [(r, second[key]) for r in one if (key := (r["set"], r["case"])) in second]
     tests = {n: (c, lambda r: r["right"]) for n, c in CATEGORIES.items()}
@@ -112,9 +106,7 @@ def study(options) -> dict:
 
 
 def beyond_days(lines: list[dict]) -> dict:
-    """First names of single causes that a day's drift of trims and thrust can't
-    make.
-    """
+    """First names of single causes that a day's drift of trims and thrust can't make."""
     asked = [r for r in lines if r["category"] == "single" and not set(r["truth"]) & set(DRIFTING)]
     return {"hits": sum(r["right"] for r in asked), "n": len(asked)}
 

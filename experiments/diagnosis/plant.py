@@ -1,8 +1,8 @@
 """The plant: vehicles in the air under commands from anywhere, or along references.
 
-`Flight` is what flies: body (1 kHz), firmware (500 Hz), battery, link and the poses as
-they are seen, 2 ms at a time. `fly` commands it with the exam's controllers along
-references and returns the true motion. Arrays have the body index last.
+`Flight` is what flies: body (1 kHz), firmware (500 Hz), battery, link and the poses as they are
+seen, 2 ms at a time. `fly` commands it with the exam's controllers along references and returns the
+true motion. Arrays have the body index last.
 """
 
 from collections.abc import Callable
@@ -123,8 +123,8 @@ class Flight:
         ]
 
     def look(self):
-        """Sample the sensors: the pose into `history`, the firmware's gyroscope into
-        `gyro`. Once before each `step`.
+        """Sample the sensors: the pose into `history`, the firmware's gyroscope into `gyro`. Once
+        before each `step`.
         """
         s = self.sample
         body = self.body
@@ -134,8 +134,8 @@ class Flight:
         self.gyro = self.firmware.gyro_filter(seen)
 
     def seen(self):
-        """Position (3, B), quaternion (4, B) and velocity (3, B) as the motion capture
-        gives them now, late and noisy.
+        """Position (3, B), quaternion (4, B) and velocity (3, B) as the motion capture gives them
+        now, late and noisy.
         """
         p = self.p
         air = self.air
@@ -164,8 +164,8 @@ class Flight:
         self.commands[self.sample // PER_TICK] = command
 
     def step(self):
-        """Two milliseconds after `look`; returns the command in force and the motor
-        commands (4, B).
+        """Two milliseconds after `look`; returns the command in force and the motor commands (4,
+        B).
         """
         s = self.sample
         k = self.sample // PER_TICK

@@ -3,12 +3,12 @@
     python -m experiments.diagnosis.quantile CASES.jsonl … --referred CASES.jsonl …
     --source WORDS --out src/openjax/gap/residual.json
 
-Reads what `development` wrote, without references and with them (`--healthy`). Writes
-the residual check's measures over all cases in which nothing unknown acts, whatever was
-named: the engine takes conformal p-values among them (Vovk, Gammerman, Shafer 2005).
-Without any CASES those of the file stay. Prints, each beside the one in use, the power
-of level over p-value that makes the odds of an unknown cause likeliest, and the
-reliability of the probabilities under which the right classes are likeliest.
+Reads what `development` wrote, without references and with them (`--healthy`). Writes the residual
+check's measures over all cases in which nothing unknown acts, whatever was named: the engine takes
+conformal p-values among them (Vovk, Gammerman, Shafer 2005). Without any CASES those of the file
+stay. Prints, each beside the one in use, the power of level over p-value that makes the odds of an
+unknown cause likeliest, and the reliability of the probabilities under which the right classes are
+likeliest.
 """
 
 import argparse
@@ -44,8 +44,8 @@ def pairs_of(lines: list[dict]) -> list[dict[str, dict[str, float]]]:
 
 
 def best_power(lines: list[dict]) -> float:
-    """The power of level over p-value that makes it likeliest in which cases something
-    unknown acts.
+    """The power of level over p-value that makes it likeliest in which cases something unknown
+    acts.
     """
     told = []
     for line in lines:
@@ -65,8 +65,8 @@ def best_power(lines: list[dict]) -> float:
 
 
 def best_reliability(lines: list[dict]) -> float:
-    """The reliability that makes the right classes likeliest, from probabilities made
-    with the one in use.
+    """The reliability that makes the right classes likeliest, from probabilities made with the one
+    in use.
     """
     told = [(r["probabilities"], r["right_names"]) for r in lines if r.get("probabilities")]
 

@@ -28,8 +28,8 @@ TRIM = 0.01  # of a rotor's thrust
 
 @dataclass(frozen=True)
 class Truth:
-    """One flight's vehicle and air. Lags and delay in s; `inertia` and `yaw` as
-    multiples; `damping` 1/s; `gust` rad/s^2.
+    """One flight's vehicle and air. Lags and delay in s; `inertia` and `yaw` as multiples;
+    `damping` 1/s; `gust` rad/s^2.
     """
 
     up: float = 0.025

@@ -1,10 +1,9 @@
-"""Real vehicles in the family of plants: errors of form that nobody tells the simulator
-and that aren't a case's cause.
+"""Real vehicles in the family of plants: errors of form that nobody tells the simulator and that
+aren't a case's cause.
 
-Ranges: motors of 65 to 85 ms, different up and down, 4 to 6 ms late, and gyroscopes of
-.93 to 1.11 were measured on small brushed vehicles in published flights; maps from duty
-cycle to thrust are off the public one by ± 30 % in curvature; propellers of such
-vehicles have some 3.5e-8 kg m^2.
+Ranges: motors of 65 to 85 ms, different up and down, 4 to 6 ms late, and gyroscopes of .93 to 1.11
+were measured on small brushed vehicles in published flights; maps from duty cycle to thrust are off
+the public one by ± 30 % in curvature; propellers of such vehicles have some 3.5e-8 kg m^2.
 """
 
 import numpy as np
@@ -21,9 +20,7 @@ HEAVIEST_ON_MAP = 0.034  # kg: beyond, the map's parabola ends below full thrust
 
 
 def draw(rng, stranger=False):
-    """(Told, form errors) of a real vehicle; strangers are heavier and have larger
-    errors.
-    """
+    """(Told, form errors) of a real vehicle; strangers are heavier and have larger errors."""
     mass = float(rng.uniform(0.05, 0.09) if stranger else rng.uniform(0.027, 0.05))
     size = mass / MASS
     thrust = mass * GRAVITY / (4 * rng.uniform(0.45, 0.62) * MAX_SPEED**2)
@@ -82,8 +79,8 @@ def apply(errors, p, c):
 
 
 def as_logged(errors, told, rows):
-    """The rows with motors as duty cycles where the vehicle is commanded so: the
-    firmware's battery compensation.
+    """The rows with motors as duty cycles where the vehicle is commanded so: the firmware's battery
+    compensation.
     """
     if not (errors and errors["pwm"]):
         return rows

@@ -1,13 +1,13 @@
-"""What the diagnosis says of folders of published flights whose causes nobody knows in
-full: names, sizes, and the response of the torques.
+"""What the diagnosis says of folders of published flights whose causes nobody knows in full: names,
+sizes, and the response of the torques.
 
     python -m experiments.diagnosis.real_flights FOLDER ... --separate FOLDER --jobs 2
     --out experiments/results/real/real.json
 
-A folder is one case, or holds several. Of a folder after `--each` each flight is a case
-of its own. Of one after `--separate` it is so twice, once with its own rows and once
-with rows of 100 Hz that hold the motors' means, as laboratories log them: both are of
-one vehicle, so that what rows hide shows as a difference.
+A folder is one case, or holds several. Of a folder after `--each` each flight is a case of its own.
+Of one after `--separate` it is so twice, once with its own rows and once with rows of 100 Hz that
+hold the motors' means, as laboratories log them: both are of one vehicle, so that what rows hide
+shows as a difference.
 """
 
 import argparse
@@ -35,8 +35,8 @@ def cases_of(folder: Path) -> list[Path]:
 
 
 def as_means(case):
-    """A case of fast rows with rows of PERIOD: sensors at a row's time, motors as means
-    from there to the next.
+    """A case of fast rows with rows of PERIOD: sensors at a row's time, motors as means from there
+    to the next.
     """
     flights = []
     for flight in case.flights:
@@ -121,8 +121,8 @@ def groups_of(names: list[str]) -> dict[str, list[str]]:
 
 
 def figures(found: list[dict]) -> dict:
-    """How often each name stands somewhere, first, and with a probability of .5, by
-    groups of cases; and in how many motors are clearly slower than NOMINAL.
+    """How often each name stands somewhere, first, and with a probability of .5, by groups of
+    cases; and in how many motors are clearly slower than NOMINAL.
     """
     by_name = {case["case"]: case for case in found}
 
@@ -148,8 +148,8 @@ def figures(found: list[dict]) -> dict:
 
 
 def draw(cases: list[dict], path: Path) -> None:
-    """Drag over mass of each case that names it, with its 90 % interval; hollow where
-    another name stands first.
+    """Drag over mass of each case that names it, with its 90 % interval; hollow where another name
+    stands first.
     """
     import matplotlib
 

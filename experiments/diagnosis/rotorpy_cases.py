@@ -68,8 +68,8 @@ def make_case(job):
 
 
 def floor_of(told, drawn, joined, flights):
-    """(seen, floor): mean squares (12,) of the told vehicle without a cause, and root
-    mean squares of what air, sensors and the rows of the log leave to a true one.
+    """(seen, floor): mean squares (12,) of the told vehicle without a cause, and root mean squares
+    of what air, sensors and the rows of the log leave to a true one.
     """
     many = [told] * 3
     none = np.zeros(3, bool)

@@ -12,16 +12,14 @@ TUNNEL_HEIGHT = 0.65  # m
 
 
 def hubs(x=0.0, y=0.0):
-    """Rotors of RotorPy's vehicle, numbered as the firmware has them, about a centre of
-    mass at (x, y) m.
+    """Rotors of RotorPy's vehicle, numbered as the firmware has them, about a centre of mass at (x,
+    y) m.
     """
     return {f"r{i + 1}": np.array([v.ROTOR_X[i] - x, v.ROTOR_Y[i] - y, 0.0]) for i in range(4)}
 
 
 def rotorpy_vehicle(told, changed):
-    """RotorPy's parameter dict of the told vehicle without aerodynamics, with some
-    entries changed.
-    """
+    """RotorPy's parameter dict of the told vehicle without aerodynamics, with some entries changed."""
     out = {
         "mass": told.mass,
         "num_rotors": 4,

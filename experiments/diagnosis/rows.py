@@ -80,9 +80,9 @@ def _inputs(flown, j, times, hover):
 
 
 def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
-    """Rows of body j: dict column -> (n,) with NaN where a channel was not sampled; `t`
-    first. All groups are made, the caller leaves out what was not logged. `unknown`:
-    causes that sit in sensors.
+    """Rows of body j: dict column -> (n,) with NaN where a channel was not sampled; `t` first. All
+    groups are made, the caller leaves out what was not logged. `unknown`: causes that sit in
+    sensors.
     """
     seconds = 0.01 * ticks
     rate = sensors["rate"]
@@ -97,8 +97,8 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
         wander = coloured(rng, len(flown["rates"]), 2, 2.0, 1e-3 * sensors["wander"], SAMPLE)
 
     def stream(signal, times, clock):
-        """A 500 Hz signal as its stream delivers it at `times`, by the IMU's clock (0)
-        or the motors' (1).
+        """A 500 Hz signal as its stream delivers it at `times`, by the IMU's clock (0) or the
+        motors' (1).
         """
         own = np.arange(0, seconds, 1 / sensors["stream_rate"]) if sensors["stream_rate"] else times
         values = at(signal, own + (0.0 if wander is None else at(wander[:, clock], own)))

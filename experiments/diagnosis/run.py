@@ -28,8 +28,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def fly(column: str, count: int, options) -> str:
-    """Fly a column in a process of its own, which sees nothing of the diagnosis; the
-    SHA-256 of its answers.
+    """Fly a column in a process of its own, which sees nothing of the diagnosis; the SHA-256 of its
+    answers.
     """
     work = options.work.resolve()
     logs = work / column

@@ -33,8 +33,8 @@ TURBULENCE = {"none": (0.0, 0.05), "light": (0.3, 1.2), "strong": (2.0, 4.0)}
 
 
 def coloured(rng, count, axes, time, rms, step):
-    """First-order noise (count, axes) of correlation time `time` (s) and the given rms,
-    sampled every `step` (s).
+    """First-order noise (count, axes) of correlation time `time` (s) and the given rms, sampled
+    every `step` (s).
     """
     keep = np.exp(-step / time)
     white = rng.standard_normal((count, axes)) * np.sqrt(1 - keep**2)
@@ -43,8 +43,8 @@ def coloured(rng, count, axes, time, rms, step):
 
 
 def narrow(rng, count, axes, frequency, quality, rms, step):
-    """Narrow-band noise (count, axes) around `frequency` (Hz): white noise through a
-    resonance of the given quality.
+    """Narrow-band noise (count, axes) around `frequency` (Hz): white noise through a resonance of
+    the given quality.
     """
     pole = np.exp(-np.pi * frequency / quality * step)
     a = [1.0, -2 * pole * np.cos(2 * np.pi * frequency * step), pole * pole]
@@ -53,8 +53,8 @@ def narrow(rng, count, axes, frequency, quality, rms, step):
 
 
 def _channels(rng, needed):
-    """Letters of the logged groups: what an effect needs is there, the rest is drawn;
-    always a legal log.
+    """Letters of the logged groups: what an effect needs is there, the rest is drawn; always a
+    legal log.
     """
     have = set(needed) | {letter for letter, chance in LOGGED.items() if rng.random() < chance}
     if "p" not in have:
@@ -68,8 +68,8 @@ def _channels(rng, needed):
 
 
 def draw(rng, kind, needed="", turbulence=None):
-    """Sensors and air of a case: a dict of plain numbers, see the keys below. `needed`:
-    letters of `GROUPS`.
+    """Sensors and air of a case: a dict of plain numbers, see the keys below. `needed`: letters of
+    `GROUPS`.
     """
     # good and bad instruments
     size = float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))
@@ -141,8 +141,8 @@ def draw(rng, kind, needed="", turbulence=None):
 
 
 def draw_air(rng, sensors, ticks, voltage, strong=1.0):
-    """Air, gyroscope and pose of one body in one flight as `plant.fly` wants them (no
-    body axis yet).
+    """Air, gyroscope and pose of one body in one flight as `plant.fly` wants them (no body axis
+    yet).
     """
     samples = 5 * ticks
     size = sensors["size"]
@@ -175,15 +175,15 @@ def draw_air(rng, sensors, ticks, voltage, strong=1.0):
 
 
 def holds_poses(sensors):
-    """Whether rows repeat the last pose, which makes them late by half the hold on
-    average, whatever flies.
+    """Whether rows repeat the last pose, which makes them late by half the hold on average,
+    whatever flies.
     """
     return sensors["kind"] == "stale" and "p" in sensors["channels"]
 
 
 def pose_lag(delay_ms, sensors):
-    """By how much poses in the log are late, ms: the cause together with the motion
-    capture's own; None if they are held.
+    """By how much poses in the log are late, ms: the cause together with the motion capture's own;
+    None if they are held.
     """
     return None if holds_poses(sensors) else delay_ms + sensors["pose_delay"]
 
@@ -200,8 +200,8 @@ def vibration(rng, sensors, samples, rms):
 
 
 def apply_nuisances(p, columns, sensors):
-    """What is off in every case: thrust, motor time, yaw torque, moments of inertia,
-    and the firmware's filters.
+    """What is off in every case: thrust, motor time, yaw torque, moments of inertia, and the
+    firmware's filters.
     """
     lag, yaw, *moments = sensors["constants_off"]
     p["rotor_gain"][:, columns] *= 1 + sensors["thrust_offset"]

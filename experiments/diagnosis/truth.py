@@ -19,8 +19,8 @@ CARRIES = {"blade_flapping": "rotor_drag", "wind": "rotor_drag"}
 
 @dataclass(frozen=True)
 class Truth:
-    """`right` holds the acceptable names of each effect that shows, strongest first;
-    `fine` what is no mistake.
+    """`right` holds the acceptable names of each effect that shows, strongest first; `fine` what is
+    no mistake.
     """
 
     category: str
@@ -51,8 +51,8 @@ def read_answers(path: Path) -> dict[str, dict]:
 
 
 def words_of(report: dict | None) -> list[str]:
-    """What a report says, best first: effects and "unknown", nothing for "none",
-    "garbage" where it was refused.
+    """What a report says, best first: effects and "unknown", nothing for "none", "garbage" where it
+    was refused.
     """
     if report is None:
         return ["garbage"]
@@ -99,8 +99,8 @@ def right_names(truth: Truth) -> frozenset[str]:
 
 
 def top_probability(right, probabilities: dict[str, float]) -> tuple[float, bool] | None:
-    """(probability of the most probable class, whether it is the true one); the names
-    that are `right` count as one.
+    """(probability of the most probable class, whether it is the true one); the names that are
+    `right` count as one.
     """
     if not probabilities:
         return None

@@ -17,9 +17,7 @@ from experiments.diagnosis.vehicle import multiply, rotate_back
 
 
 class Site(NamedTuple):
-    """Where a kind acts: (smallest, largest) root mean square, its unit, whether in the
-    logs alone.
-    """
+    """Where a kind acts: (smallest, largest) root mean square, its unit, whether in the logs alone."""
 
     sizes: tuple
     unit: str
@@ -53,8 +51,8 @@ SLOWEST, FASTEST = 0.3, 4.0  # Hz, of a kind that time has a part in
 
 
 class Generated:
-    """The functions of some bodies' causes: calls give values (n,) with a root mean
-    square of about one.
+    """The functions of some bodies' causes: calls give values (n,) with a root mean square of about
+    one.
     """
 
     def __init__(self, causes):
@@ -107,8 +105,8 @@ class Generated:
         )
 
     def __call__(self, inputs, time):
-        """Values (n,) at inputs (14, n), of which the last row is replaced by the time
-        since the onset.
+        """Values (n,) at inputs (14, n), of which the last row is replaced by the time since the
+        onset.
         """
         x = np.concatenate([inputs, np.broadcast_to(time - self.onset, (1, inputs.shape[1]))])
         waves = np.cos(np.einsum("fin,in->fn", self.waves, x) + self.phases).sum(0)
@@ -118,8 +116,8 @@ class Generated:
 
 
 def inputs_of(position, q, velocity, rates, motors, voltage, hover):
-    """(14, n) what the functions depend on, each about normally distributed: positions,
-    velocities and rates (3, n), q and motors (4, n), voltage and hover command (n,).
+    """(14, n) what the functions depend on, each about normally distributed: positions, velocities
+    and rates (3, n), q and motors (4, n), voltage and hover command (n,).
     """
     middle = position - np.array([[0.0], [0.0], [0.6]])
     rows = [middle, rotate_back(q, velocity), rates, motors - hover, voltage[None] - 3.7]
@@ -177,9 +175,7 @@ class Unknowns:
 
 
 def misread(causes, inputs, times):
-    """{site: (n, 3)} by how much the sensors of one body are off at `times` (n,);
-    `inputs` (14, n).
-    """
+    """{site: (n, 3)} by how much the sensors of one body are off at `times` (n,); `inputs` (14, n)."""
     out = {}
     for cause in causes:
         function = Generated([cause])

@@ -1,9 +1,9 @@
-"""The vehicle of the exam's plants: published constants, parameters per simulated body,
-and vector helpers.
+"""The vehicle of the exam's plants: published constants, parameters per simulated body, and vector
+helpers.
 
-Nothing is imported from `openjax`, so that a mistake in one is not repeated in the
-other. Arrays carry the body index last, (3, B) or (4, B). Frames: world z up, body x
-forward, y left, z up, quaternions wxyz body to world.
+Nothing is imported from `openjax`, so that a mistake in one is not repeated in the other. Arrays
+carry the body index last, (3, B) or (4, B). Frames: world z up, body x forward, y left, z up,
+quaternions wxyz body to world.
 """
 
 from dataclasses import dataclass
@@ -33,8 +33,8 @@ OUTPUT_LIMIT = 32767.0
 
 @dataclass(frozen=True)
 class Told:
-    """What the simulator is told about a vehicle: mass kg, thrust constant N s^2,
-    k_m/k_f m, motor time s, inertia kg m^2.
+    """What the simulator is told about a vehicle: mass kg, thrust constant N s^2, k_m/k_f m, motor
+    time s, inertia kg m^2.
     """
 
     mass: float = MASS
@@ -51,8 +51,8 @@ class Told:
 
 
 def draw_told(rng):
-    """A vehicle of 27 to 45 g. A heavy one carries stronger motors; constants are off
-    the published ones by some per cent.
+    """A vehicle of 27 to 45 g. A heavy one carries stronger motors; constants are off the published
+    ones by some per cent.
     """
     mass = float(rng.uniform(0.027, 0.045))
     standard = mass < 0.037 and rng.random() < 0.6
@@ -76,8 +76,8 @@ def draw_told(rng):
 
 
 def toml(told, source, sensors, command="thrust"):
-    """Text of the case's `vehicle.toml`: the vehicle as told, and what a laboratory
-    knows of its logger.
+    """Text of the case's `vehicle.toml`: the vehicle as told, and what a laboratory knows of its
+    logger.
     """
     lines = ["[vehicle]", 'name = "crazyflie-2.1"', f"mass = {told.mass:.5f}"]
     lines += [
@@ -162,9 +162,7 @@ NEUTRAL = {
 
 
 def nominal_parameters(told):
-    """Parameters of the bodies described by a list of `Told`, as told. Effects
-    overwrite entries.
-    """
+    """Parameters of the bodies described by a list of `Told`, as told. Effects overwrite entries."""
     count = len(told)
 
     def rows(values):
@@ -242,8 +240,8 @@ def turn(q, w, dt):
 
 
 def mix(thrust, output):
-    """Firmware mixer: collective thrust (B,) 0..1 and outputs (3, B) in counts to motor
-    commands (4, B) in 0..1.
+    """Firmware mixer: collective thrust (B,) 0..1 and outputs (3, B) in counts to motor commands
+    (4, B) in 0..1.
     """
     roll, pitch, yaw = np.minimum(np.maximum(output, -OUTPUT_LIMIT), OUTPUT_LIMIT) / 65536.0
     r = roll / 2

@@ -1,11 +1,9 @@
-"""The map of what can be caught: `python -m experiments.evaders.catch_map NAME=FILE
-...`.
+"""The map of what can be caught: `python -m experiments.evaders.catch_map NAME=FILE ...`.
 
-Each FILE is what `openjax map --json FILE` wrote, by the names of `KINDS`: the whole
-map in an empty arena, and maps in which one thing is taken away. A map may come in
-several files of that name, with cells of its own in each. Losses are means over the
-cells that both maps have, which are flown from the same starts. Draws the eight small
-maps, and the page to move about in.
+Each FILE is what `openjax map --json FILE` wrote, by the names of `KINDS`: the whole map in an
+empty arena, and maps in which one thing is taken away. A map may come in several files of that
+name, with cells of its own in each. Losses are means over the cells that both maps have, which are
+flown from the same starts. Draws the eight small maps, and the page to move about in.
 """
 
 import itertools
@@ -29,9 +27,7 @@ KINDS = {
     "sight": "seeing 90 degrees, one metre far",
     "messages": "a fifth of the messages lost, the rest .1 s late",
 }
-"""Maps, and how the page calls them; the first is the one that others are compared
-with.
-"""
+"""Maps, and how the page calls them; the first is the one that others are compared with."""
 WHO = ("scripted", "learned", "planner")
 OFTEN = 0.9
 REACHES = {"reach_20": 0.2, "reach_30": 0.3, "reach_50": 0.5}
@@ -52,9 +48,8 @@ def study(options) -> dict:
 
 
 def whole_map(parts: list[dict]) -> dict:
-    """One map of those that `openjax map` wrote of some cells each, and their seconds
-    together; of all else, as the machine and how evaders learned, it holds the first
-    one's.
+    """One map of those that `openjax map` wrote of some cells each, and their seconds together; of
+    all else, as the machine and how evaders learned, it holds the first one's.
     """
     cells = [cell for part in parts for cell in part["cells"]]
     seconds = sum(part["seconds"] for part in parts)
@@ -83,8 +78,8 @@ def mean_rate(cells: list[dict]) -> float | None:
 
 
 def fastest_caught(cells: Mapping, radius: float) -> float | None:
-    """The speed ratio up to which, with this radius, the evader is caught `OFTEN` at
-    each of a size's ratios; None where it is at none.
+    """The speed ratio up to which, with this radius, the evader is caught `OFTEN` at each of a
+    size's ratios; None where it is at none.
     """
     rates = {key[1]: cell["capture_rate"] for key, cell in cells.items() if key[2] == radius}
     caught = itertools.takewhile(lambda ratio: rates[ratio] >= OFTEN, sorted(rates))
@@ -92,8 +87,8 @@ def fastest_caught(cells: Mapping, radius: float) -> float | None:
 
 
 def mean_difference(cells: Mapping, others: Mapping) -> float | None:
-    """Mean of the capture rates of other cells less those of the same cells; None where
-    none is in both.
+    """Mean of the capture rates of other cells less those of the same cells; None where none is in
+    both.
     """
     common = [key for key in cells if key in others]
     pairs = [others[key]["capture_rate"] - cells[key]["capture_rate"] for key in common]

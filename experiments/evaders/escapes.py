@@ -1,11 +1,10 @@
-"""How evaders that plan get away: `python -m experiments.evaders.escapes --json FILE
-[--clock S]`.
+"""How evaders that plan get away: `python -m experiments.evaders.escapes --json FILE [--clock S]`.
 
-Records where everybody is in episodes against a planner, and says of the episodes
-without a capture, second by second, how fast the pursuers fly, how near they are,
-whether they see the evader, and how they stand round it. With `--opponent`, a file of
-`openjax exploit`, that evader flies, not a planner. With `--clock` the time that the
-pursuers observe stands still from then on, and the planner knows it.
+Records where everybody is in episodes against a planner, and says of the episodes without a
+capture, second by second, how fast the pursuers fly, how near they are, whether they see the
+evader, and how they stand round it. With `--opponent`, a file of `openjax exploit`, that evader
+flies, not a planner. With `--clock` the time that the pursuers observe stands still from then on,
+and the planner knows it.
 """
 
 import argparse
@@ -101,17 +100,13 @@ class OwnRule(RecedingHorizon):
 
 
 def record(evaders: RecedingHorizon, parameters, tasks, key) -> Moment:
-    """An episode of the evaders on each of tasks (B, ...), a moment each time they
-    plan.
-    """
+    """An episode of the evaders on each of tasks (B, ...), a moment each time they plan."""
     start = evaders.duel.start(tasks, key)
     return evaders.fly_and_keep(parameters, start, key, moment)[1]
 
 
 def open_angle(moments: Moment) -> np.ndarray:
-    """(T, B) degrees, the widest angle from above between neighbouring pursuers round
-    the evader.
-    """
+    """(T, B) degrees, the widest angle from above between neighbouring pursuers round the evader."""
     offset = moments.pursuers - moments.evader[:, :, None]
     angle = np.sort(np.arctan2(offset[..., 1], offset[..., 0]), axis=-1)
     turn = np.concatenate([angle, angle[..., :1] + 2 * np.pi], axis=-1)
@@ -119,9 +114,7 @@ def open_angle(moments: Moment) -> np.ndarray:
 
 
 def summary(moments: Moment, game: PursuitSettings, replan: int) -> dict:
-    """Of one kind of tasks: captures, and medians over the episodes without one, for
-    each second.
-    """
+    """Of one kind of tasks: captures, and medians over the episodes without one, for each second."""
     free = ~moments.captured[-1]
     found = {"episodes": len(free), "captures": int((~free).sum())}
     if not free.any():

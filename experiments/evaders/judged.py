@@ -1,12 +1,10 @@
-"""Policies before the second judge: `python -m experiments.evaders.judged NAME=FILE
-...`.
+"""Policies before the second judge: `python -m experiments.evaders.judged NAME=FILE ...`.
 
-Each FILE is what `openjax exploit --policy NAME --json FILE` wrote: evaders that
-learned against the policy, one that plans in the true simulation, and the scripted
-ones. None of them trained the pursuers. The slower vehicle is `--effects experiments/flying/slower.toml`.
-Stores the least capture rate of each kind, and of the learners over the steps that they
-have learned; makes table and picture of judged.md, and writes the figures of README and
-pages (`experiments.figures`).
+Each FILE is what `openjax exploit --policy NAME --json FILE` wrote: evaders that learned against
+the policy, one that plans in the true simulation, and the scripted ones. None of them trained the
+pursuers. The slower vehicle is `--effects experiments/flying/slower.toml`. Stores the least capture
+rate of each kind, and of the learners over the steps that they have learned; makes table and
+picture of judged.md, and writes the figures of README and pages (`experiments.figures`).
 """
 
 from collections.abc import Callable, Mapping
@@ -37,9 +35,7 @@ JUDGES: Mapping[str, Callable[[str], bool]] = {
 
 
 def row(policy: str, vehicle: str, judge: str, records: list[dict]) -> dict:
-    """The evader of a kind that is caught least in each kind of tasks, with intervals
-    of 95 %.
-    """
+    """The evader of a kind that is caught least in each kind of tasks, with intervals of 95 %."""
     worst = verdict(records)
     fields = ("capture_rate", "interval", "crash_rate")
     return {

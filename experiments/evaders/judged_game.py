@@ -1,6 +1,4 @@
-"""The game and the tasks by which a policy is judged, for programs beside `openjax
-exploit`.
-"""
+"""The game and the tasks by which a policy is judged, for programs beside `openjax exploit`."""
 
 import argparse
 import dataclasses
@@ -32,9 +30,7 @@ class JudgedGame:
 
     @property
     def flown(self) -> dict:
-        """Whose game it was: policy, vehicle and effects, as `openjax exploit` stores
-        them.
-        """
+        """Whose game it was: policy, vehicle and effects, as `openjax exploit` stores them."""
         vehicle = self.options.vehicle or self.environment.settings.airframe
         effects = self.environment.effect_parameters
         return {"policy": self.loaded.source, "vehicle": str(vehicle), "effects": effects}
@@ -56,9 +52,7 @@ def game_parser(doc: str | None, episodes: int, uniform: int) -> argparse.Argume
 
 
 def judged_game(options: argparse.Namespace) -> JudgedGame:
-    """As `openjax exploit` has it: one vehicle, honest physics, the reward counts for
-    nothing.
-    """
+    """As `openjax exploit` has it: one vehicle, honest physics, the reward counts for nothing."""
     cache_programs()
     loaded = load_policy(options.policy).of_team(LAYOUT_PURSUERS)
     own = loaded.settings.environment

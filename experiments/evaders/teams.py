@@ -1,10 +1,10 @@
 """The page of teams: `python -m experiments.evaders.teams NAME=FILE ...`.
 
-Each FILE is what `openjax map --speed_ratios 1.3 --radii 0.3 --scenario uniform --json
-FILE` wrote: one cell for each size of team, by the names of `KINDS`. The table shows
-what a policy catches, alone and with what is taken from it. `seed_2_sizes=FILE` and
-others like it are what single policies of other trainings catch; `judged=FILE` is what
-`openjax exploit` found of a policy. Names that the table doesn't know are kept.
+Each FILE is what `openjax map --speed_ratios 1.3 --radii 0.3 --scenario uniform --json FILE` wrote:
+one cell for each size of team, by the names of `KINDS`. The table shows what a policy catches,
+alone and with what is taken from it. `seed_2_sizes=FILE` and others like it are what single
+policies of other trainings catch; `judged=FILE` is what `openjax exploit` found of a policy. Names
+that the table doesn't know are kept.
 """
 
 from collections.abc import Mapping

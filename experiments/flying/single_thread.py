@@ -1,5 +1,5 @@
-"""One thread per process, for programs whose processes are the parallel part; and work
-shared out to them.
+"""One thread per process, for programs whose processes are the parallel part; and work shared out
+to them.
 """
 
 import math
@@ -29,11 +29,11 @@ def use_single_thread() -> None:
 def share_out(
     do: Callable, jobs: Iterable[tuple], processes: int, seconds: float = math.inf
 ) -> Iterator[Any]:
-    """What `do(*job)` gives in one of so many processes, as it comes; none is begun
-    after `seconds`.
+    """What `do(*job)` gives in one of so many processes, as it comes; none is begun after
+    `seconds`.
 
-    A job that fails is a line on standard error, and the others go on; RuntimeError at
-    the end says how many did.
+    A job that fails is a line on standard error, and the others go on; RuntimeError at the end says
+    how many did.
     """
     latest = time.time() + seconds
     failed = 0

@@ -40,9 +40,7 @@ FIGURES = {
 
 
 def vehicles(airframe: str = NOMINAL) -> dict[str, np.ndarray]:
-    """Bounds (R, 4) of each kind of an airframe's vehicles; only the family has any
-    that are rare.
-    """
+    """Bounds (R, 4) of each kind of an airframe's vehicles; only the family has any that are rare."""
     family = vehicle_family(airframe)
     names = [entry.parameter for entry in family]
     none = np.repeat([[find_parameter(name)[1].none] for name in names], 4, axis=1).astype(

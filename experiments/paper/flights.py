@@ -1,5 +1,5 @@
-"""Flights for the paper's tables: many episodes of one policy in one compiled call,
-each with its own evader speed.
+"""Flights for the paper's tables: many episodes of one policy in one compiled call, each with its
+own evader speed.
 """
 
 import dataclasses
@@ -29,8 +29,8 @@ class Flights:
 
     evaluation: Evaluation  # (B,) each
     first: jax.Array
-    """(B, R) int32, first step with a capture within each radius; episode length + 1
-    where there is none.
+    """(B, R) int32, first step with a capture within each radius; episode length + 1 where there is
+    none.
     """
 
 
@@ -44,11 +44,11 @@ def fly(
     speeds: jax.Array,
     key: jax.Array,
 ) -> Flights:
-    """One episode per task (leading axis B), with evader speeds (B,) in m/s; `key`
-    draws the start attitudes.
+    """One episode per task (leading axis B), with evader speeds (B,) in m/s; `key` draws the start
+    attitudes.
 
-    A radius changes nothing but what counts as a capture, so each flight tells it for
-    all `radii` (m).
+    A radius changes nothing but what counts as a capture, so each flight tells it for all `radii`
+    (m).
     """
     settings = environment.settings
     plain = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}

@@ -1,5 +1,5 @@
-"""The paper's tables: six methods on its layouts, its parts on layouts unlike its
-training, errors of the prediction.
+"""The paper's tables: six methods on its layouts, its parts on layouts unlike its training, errors
+of the prediction.
 """
 
 from collections.abc import Iterable

@@ -1,11 +1,11 @@
-"""The quick preset as a user with two cores meets it: the whole command, installed but
-nothing compiled, for several seeds.
+"""The quick preset as a user with two cores meets it: the whole command, installed but nothing
+compiled, for several seeds.
 
     python -m experiments.paper.quick [--seeds 0 1 2] [--at_once 1] [--options "..."]
 
-Each run has two cores of its own and an empty cache. Its policy is then flown on the
-validation tasks once more, with captures and crashes looked for in every physics step,
-and not only at those at which the policy steers.
+Each run has two cores of its own and an empty cache. Its policy is then flown on the validation
+tasks once more, with captures and crashes looked for in every physics step, and not only at those
+at which the policy steers.
 """
 
 import argparse
@@ -63,8 +63,8 @@ def record(run: Path) -> dict:
 
 
 def fly_finely(loaded: LoadedPolicy) -> dict[str, float]:
-    """Rates on the validation tasks in an environment whose step is one physics step,
-    the policy's action held between.
+    """Rates on the validation tasks in an environment whose step is one physics step, the policy's
+    action held between.
     """
     own = loaded.settings.environment
     substeps = loaded.settings.environment.substeps

@@ -23,8 +23,8 @@ COLORS = dict(zip((*METHODS, *ABLATIONS), HUES, strict=True))
 
 
 def seeds_of(label: str) -> list[tuple[str, int]]:
-    """(policy, evaluation seed) for each of a method's seeds: those of its training, or
-    of its start attitudes where there is no training.
+    """(policy, evaluation seed) for each of a method's seeds: those of its training, or of its
+    start attitudes where there is no training.
     """
     beginning = (METHODS | ABLATIONS)[label]
     if beginning in HEURISTICS:

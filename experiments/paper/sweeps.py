@@ -1,7 +1,7 @@
 """All methods over the capture radius and the evader's speed.
 
-As in the paper's two figures: the radius in `empty`, the speed in `passage`; policies
-trained at one radius and one speed fly at others.
+As in the paper's two figures: the radius in `empty`, the speed in `passage`; policies trained at
+one radius and one speed fly at others.
 """
 
 from pathlib import Path
@@ -22,9 +22,7 @@ CELLS = (("empty", SPEED), *(("passage", speed) for speed in SPEEDS))
 
 
 def figures(flown: list[Any], length: int) -> dict:
-    """Capture rate and step over the radii and over the speeds, of `Flights` for each
-    of `CELLS`.
-    """
+    """Capture rate and step over the radii and over the speeds, of `Flights` for each of `CELLS`."""
     first = np.stack([part.first for part in flown])
     is_missed = first > length
     rate = np.round(1 - is_missed.mean(axis=1), 5)

@@ -1,9 +1,9 @@
-"""The paper's tables and figures, by the shipped weights: `python -m
-experiments.paper.tables [--episodes 100]`.
+"""The paper's tables and figures, by the shipped weights: `python -m experiments.paper.tables
+[--episodes 100]`.
 
-Flies every method once, all its layouts, capture radii and evader speeds in one
-compiled call, and stores what came of it in experiments/results/tables.json; the page
-is made from there. `--report` makes it again.
+Flies every method once, all its layouts, capture radii and evader speeds in one compiled call, and
+stores what came of it in experiments/results/tables.json; the page is made from there. `--report`
+makes it again.
 """
 
 import argparse
@@ -84,8 +84,8 @@ def call_of(name: str, seed: int, limit: str, physics: str, episodes: int) -> tu
 
 
 def of_policy(name: str, seed: int, limit: str, physics: str, episodes: int) -> dict:
-    """By layout: the record of a policy, what it did there, the paths of one episode;
-    and its two sweeps.
+    """By layout: the record of a policy, what it did there, the paths of one episode; and its two
+    sweeps.
     """
     call = call_of(name, seed, limit, physics, episodes)
     game = call[0].settings
@@ -103,8 +103,8 @@ def of_policy(name: str, seed: int, limit: str, physics: str, episodes: int) -> 
 
 
 def all_calls() -> dict[tuple[str, str], list[tuple[str, int]]]:
-    """Policies and seeds by method and condition; heuristics fly without the clamp,
-    too: no training chose their speed.
+    """Policies and seeds by method and condition; heuristics fly without the clamp, too: no
+    training chose their speed.
     """
     return {
         (label, condition): seeds_of(label)

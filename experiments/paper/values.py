@@ -5,8 +5,8 @@ from pathlib import Path
 from openjax.files import read_toml
 
 MAIN, PARTS, PREDICTION = read_toml(Path(__file__).with_name("values.toml")).values()
-"""By layout and method: means and standard deviations, of the main table and of layouts
-unlike the training's. By layout: mean error of OPEN's predicted next position (m).
+"""By layout and method: means and standard deviations, of the main table and of layouts unlike the
+training's. By layout: mean error of OPEN's predicted next position (m).
 """
 
 

@@ -1,8 +1,8 @@
 """Seconds that somebody new waits for on a CPU, and steps a second of Gymnasium's vector
 environments: `python -m experiments.speed.newcomer`.
 
-Commands are whole processes, each timed after one run that isn't counted, so that
-compiled programs are kept. Beside the game stands a peer of Gymnasium's own.
+Commands are whole processes, each timed after one run that isn't counted, so that compiled programs
+are kept. Beside the game stands a peer of Gymnasium's own.
 """
 
 import argparse
@@ -32,6 +32,8 @@ COMMANDS = {
 }
 """The goal in seconds of each, and what Python is told."""
 STEPS = 200
+LEARNT = 8192
+"""Steps that Stable-Baselines3 learns, four of its rollouts."""
 
 
 def seconds(arguments: tuple[str, ...], runs: int, cache: str) -> list[float]:
@@ -62,6 +64,18 @@ def steps_a_second(environment, number: int) -> float:
     return number * STEPS / best
 
 
+def learned_steps_a_second(name: str) -> float:
+    """Steps a second of Stable-Baselines3's PPO on one environment, with its own settings."""
+    import gymnasium
+    from stable_baselines3 import PPO
+
+    model = PPO("MlpPolicy", gymnasium.make(name), device="cpu", seed=0)
+    model.learn(model.n_steps)  # compiles
+    began = time.perf_counter()
+    model.learn(LEARNT)
+    return LEARNT / (time.perf_counter() - began)
+
+
 def study(options: argparse.Namespace) -> dict:
     """All rows."""
     import gymnasium
@@ -81,6 +95,13 @@ def study(options: argparse.Namespace) -> dict:
             rate = steps_a_second(environment, number)
             speeds.append({"what": f"{name}, {number} worlds", "steps": rate})
     lacks = [name for name in ("stable_baselines3", "mpe2") if not importlib.util.find_spec(name)]
+    if "stable_baselines3" not in lacks:
+        for name in ("openjax/Pursuit-v0", "Pendulum-v1"):
+            row = {
+                "what": f"Stable-Baselines3's PPO, {name}",
+                "steps": learned_steps_a_second(name),
+            }
+            speeds.append(row)
     return {"waits": waits, "speeds": speeds, "lacks": lacks}
 
 

@@ -1,12 +1,12 @@
-"""Seconds to the first update, and to a policy that catches: `python -m
-experiments.speed.seconds [--starts paper] [--seeds 1]`.
+"""Seconds to the first update, and to a policy that catches: `python -m experiments.speed.seconds
+[--starts paper] [--seeds 1]`.
 
-Runs of `openjax train`, one after the other. Each of `--starts`, a preset and its
-options in quotes, is run twice, until its first validation: first with nothing kept,
-then with compiled programs and traces kept. Then each of `--seeds` flies the first of
-them, all kept, until a validation is what is asked for (`--whole`: to its end,
-`--cold`: with nothing kept). Results are written after each run; `--go_on` adds to
-those that are there, and finds what was kept in the same `--cache`.
+Runs of `openjax train`, one after the other. Each of `--starts`, a preset and its options in
+quotes, is run twice, until its first validation: first with nothing kept, then with compiled
+programs and traces kept. Then each of `--seeds` flies the first of them, all kept, until a
+validation is what is asked for (`--whole`: to its end, `--cold`: with nothing kept). Results are
+written after each run; `--go_on` adds to those that are there, and finds what was kept in the same
+`--cache`.
 """
 
 import argparse
@@ -88,8 +88,8 @@ def begin(start: str, seed: int, out: Path, cache: Path) -> subprocess.Popen:
 
 
 def end(process: subprocess.Popen) -> None:
-    """Ask a process to save within 10 s and end; what it compiles in the background
-    isn't waited for.
+    """Ask a process to save within 10 s and end; what it compiles in the background isn't waited
+    for.
     """
     process.terminate()
     with contextlib.suppress(subprocess.TimeoutExpired):
@@ -118,8 +118,8 @@ def curve(file: Path) -> dict:
 
 
 def whole(out: Path) -> dict | None:
-    """Seconds of a run that came to its end; capture rate, crash rate and steps to the
-    capture by layout.
+    """Seconds of a run that came to its end; capture rate, crash rate and steps to the capture by
+    layout.
     """
     if not (out / "layouts.json").exists():
         return None

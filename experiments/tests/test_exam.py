@@ -21,8 +21,8 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def hovering():
-    """Two vehicles of different mass for 3 s, one holding a point, one on laps, in
-    still air and without noise.
+    """Two vehicles of different mass for 3 s, one holding a point, one on laps, in still air and
+    without noise.
     """
     many = [
         vehicle.Told(mass=0.03),
@@ -139,8 +139,8 @@ def test_the_stranger_column_shares_no_kind_with_the_known_one():
 
 
 def test_generated_kinds_differ_and_no_line_in_their_inputs_explains_them():
-    """Else a named effect, which is such a line, would be half right, and a detector
-    for one kind would find all.
+    """Else a named effect, which is such a line, would be half right, and a detector for one kind
+    would find all.
     """
     rng = np.random.default_rng(0)
     causes = [{"shape": rng.uniform(size=8), "form": "smooth"} for _ in range(40)]

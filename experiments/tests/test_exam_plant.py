@@ -25,9 +25,7 @@ FLIGHTS = {1: ("agile", "yaw", "fast"), 2: ("climb", "step", "agile"), 3: ("laps
 
 
 def fly(*numbers, causes=(), **changes):
-    """Vehicles told exactly, with hard manoeuvres in light turbulence; `changes` of
-    their sensors.
-    """
+    """Vehicles told exactly, with hard manoeuvres in light turbulence; `changes` of their sensors."""
     drawn = sensors.draw(np.random.default_rng(3), "white", "psgacmv", "light")
     drawn |= {
         "constants_off": [0.0] * 5,
@@ -61,8 +59,8 @@ def nominal():
 
 
 def _replay(vehicle, start, motors, commands, from_commands):
-    """Velocity and rates after each tick of 10 ms, replayed with the simulator's own
-    functions at 2 ms.
+    """Velocity and rates after each tick of 10 ms, replayed with the simulator's own functions at 2
+    ms.
     """
     dt = 0.002
 
@@ -142,8 +140,8 @@ def test_a_case_does_not_depend_on_its_companions(nominal):
 
 
 def test_a_factor_stands_in_for_a_battery_only_while_its_voltage_stays(monkeypatch):
-    """Else the key would want a name that no reader of one steady flight could know, or
-    let any scale pass for a battery.
+    """Else the key would want a name that no reader of one steady flight could know, or let any
+    scale pass for a battery.
     """
     monkeypatch.setattr(cases, "TICKS", 400)
     sag = effects.draw(np.random.default_rng(1), "battery_sag", "linear") | {"size": 1.2}

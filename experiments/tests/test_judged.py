@@ -66,8 +66,8 @@ def test_the_page_shows_a_short_and_the_whole_budget_of_weights_and_the_planner(
 
 
 def test_a_team_that_stands_round_the_evader_leaves_a_third_of_the_circle_open():
-    """In the first second of the first of two episodes; then all fly beside each other
-    above it, and the other episode ends with a capture.
+    """In the first second of the first of two episodes; then all fly beside each other above it,
+    and the other episode ends with a capture.
     """
     angle = 0.3 + np.array([0.0, 2.0, 4.0]) * np.pi / 3
     around = np.stack([np.cos(angle), np.sin(angle), [-0.1, 0.0, 0.1]], axis=-1)

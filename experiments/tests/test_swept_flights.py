@@ -1,5 +1,5 @@
-"""Radii and speeds that are swept over at once give what a game with that radius and
-that speed gives.
+"""Radii and speeds that are swept over at once give what a game with that radius and that speed
+gives.
 """
 
 import dataclasses

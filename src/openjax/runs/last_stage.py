@@ -1,4 +1,6 @@
-"""The stage after MAPPO of a run: its policy may become better by it, and can't become worse."""
+"""The stage after MAPPO of a run: what it makes is kept where it is better on validation tasks or,
+where it is for evaders that plan, worse by no more than `TOLERANCE`.
+"""
 
 import dataclasses
 import time
