@@ -91,7 +91,8 @@ def test_a_vehicle_that_is_known_by_name_needs_no_file_in_the_run(tmp_path):
         vehicle=Path("brushless"), out=tmp_path / "run", devices="1", settings=settings
     )
     job, _, files = prepare(command, [], 0.0, Processes())
-    assert job.settings.environment.airframe == "brushless" and files == {}
+    files.copy_to(tmp_path)
+    assert job.settings.environment.airframe == "brushless" and not any(tmp_path.iterdir())
 
 
 def test_a_run_that_another_jax_goes_on_with_says_so():

@@ -4,7 +4,6 @@ first array.
 
 import contextlib
 import dataclasses
-import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ from openjax.command_line import output_console
 from openjax.errors import UserError
 from openjax.files import remove_unfinished, to_plain
 from openjax.learning import build
+from openjax.runs.game_files import GameFiles
 from openjax.runs.job import OwnParts, TrainingJob, check_job, start_parameters
 from openjax.runs.machine import describe_machine
 from openjax.runs.other_policy import other_policy
@@ -25,9 +25,7 @@ from openjax.runs.training import run_job
 from openjax.runs.words import opening_words
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.compiled_programs import cache_programs
-from openjax.store.environments import is_evader_file, make_environment
 from openjax.store.run_directory import RunDirectory, check_free, create_run, lock_run, open_run
-from openjax.vehicle.vehicle_file import copy_vehicle_file, load_vehicle_file
 
 
 def start(
@@ -57,9 +55,7 @@ def start(
     with lock_run(directory.path) if processes.is_first else contextlib.nullcontext():
         if command.resume is None and processes.is_first:
             create_run(directory.path, command.overwrite)
-            for name, path in files.items():
-                copy = copy_vehicle_file if name == "vehicle.toml" else shutil.copyfile
-                copy(path, directory.path / name)
+            files.copy_to(directory.path)
             directory.write_settings(job.settings, job.facts)
             output_console().print(opening_words(job.settings), soft_wrap=True)
         elif processes.is_first:
@@ -82,9 +78,9 @@ def prepare(
     start_time: float,
     processes: Processes,
     own_parts: OwnParts | None = None,
-) -> tuple[TrainingJob, RunDirectory, dict[str, Path]]:
-    """The training, its directory, and the files to copy there, by their names; nothing is changed
-    yet. Arguments as of `start`.
+) -> tuple[TrainingJob, RunDirectory, GameFiles]:
+    """The training, its directory, and the files that its game is made of; nothing is changed yet.
+    Arguments as of `start`.
 
     Raises:
       UserError: whatever can be wrong with the files or the settings.
@@ -94,9 +90,9 @@ def prepare(
     own_parts = own_parts or OwnParts()
     old_run = None if command.resume is None else open_run(command.resume)
     stored_facts = {} if old_run is None else old_run.read_facts()
-    files = _files(command, old_run)
+    files = GameFiles.of(command, old_run)
     _check_parts(own_parts, files, stored_facts)
-    environment = own_parts.environment or _environment(command.settings.environment, files)
+    environment = own_parts.environment or files.environment(command.settings.environment)
     command = complete(command, environment, stored_facts)
     directory = old_run or RunDirectory(_free_directory(command, processes))
     parts = build(command.settings, environment, own_parts.policy, own_parts.learners)
@@ -114,7 +110,7 @@ def prepare(
         began=start_time,
     )
     check_job(job)
-    return (job, directory, {name: path for name, path in files.items() if path is not None})
+    return (job, directory, files)
 
 
 def _facts(command, arguments, own_parts):
@@ -134,20 +130,6 @@ def _has_begun(run):
     return run is not None and Checkpoints(run.checkpoints).any_finished()
 
 
-def _environment(game, files):
-    """The game with what `files` say; those that needn't be kept become None."""
-    environment = make_environment(
-        game, files["vehicle.toml"], files["effects.toml"], files["evader.npz"]
-    )
-    # a scripted evader, or a vehicle that is known by name, is in the settings; a
-    # function isn't in any file of the run
-    if not is_evader_file(files["evader.npz"]):
-        files["evader.npz"] = None
-    if files["vehicle.toml"] and load_vehicle_file(files["vehicle.toml"]).path is None:
-        files["vehicle.toml"] = None
-    return environment
-
-
 def other_compiler(facts: dict) -> str | None:
     """A remark for a run whose last process, by its facts, had another JAX than this one; None if
     it had the same, or the facts don't say.
@@ -163,24 +145,11 @@ def other_compiler(facts: dict) -> str | None:
     )
 
 
-def _files(command, old_run):
-    """Files that the run flies with, by their names in its directory: vehicle, effects, evader;
-    None if there is none.
-    """
-    options = {
-        "vehicle.toml": command.vehicle,
-        "effects.toml": command.effects,
-        "evader.npz": command.opponent,
-    }
-    # an option goes before what a resumed run has kept
-    return {name: path or (old_run and old_run.optional(name)) for name, path in options.items()}
-
-
 def _check_parts(parts, files, facts):
     """Raises UserError for parts of one's own that don't go with files, or with the run
     that is resumed, whose facts these are.
     """
-    if parts.environment is not None and any(files.values()):
+    if parts.environment is not None and files.are_named:
         raise UserError("an environment of your own already has its vehicle, effects and evader")
     # a new run may have any; one that is resumed and says nothing had none
     first = facts.get("own_parts", []) if facts else parts.names
