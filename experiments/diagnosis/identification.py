@@ -117,12 +117,13 @@ def logged(seen, motors, rows: Rows, vehicle) -> Track:
     )
 
 
-def study() -> list[dict]:
-    """One row for each kind of rows, vehicle and strength of gusts."""
+def study(kinds: list[str]) -> list[dict]:
+    """One row for each of these kinds of rows, vehicle and strength of gusts."""
     nominal = vehicle_of(load_vehicle())
     cases, flights = flown()
     out = []
-    for kind, rows in ROWS.items():
+    for kind in kinds:
+        rows = ROWS[kind]
         for name, gust in itertools.product(VEHICLES, GUSTS):
             records = [
                 logged(seen, motors, rows, nominal)
@@ -161,7 +162,7 @@ def summary(rows: list[dict]) -> dict:
     the truth, and how often 90 % intervals hold it.
     """
     found = {}
-    for kind in ROWS:
+    for kind in dict.fromkeys(r["rows"] for r in rows):
         of = [r for r in rows if r["rows"] == kind]
 
         def off(name, of=of):
@@ -211,14 +212,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("identification.json"))
     parser.add_argument("--flights", type=Path, nargs="*", default=[])
+    parser.add_argument(
+        "--rows", nargs="*", choices=list(ROWS), default=list(ROWS), help="others stay as they are"
+    )
     arguments = parser.parse_args()
+    out = arguments.out
+    before = json.loads(out.read_text()) if out.exists() else {"flights": {}, "rows": []}
     real = {folder.name: of_flights(folder) for folder in arguments.flights}
-    rows = study()
+    rows = [r for r in before["rows"] if r["rows"] not in arguments.rows]
+    rows += study(arguments.rows)
+    flights = before["flights"] | real
     command = "python -m experiments.diagnosis.identification"
-    command += "".join(f" --flights {name}" for name in real) + f" --out {arguments.out.name}"
-    found = {"command": command, "summary": summary(rows), "flights": real, "rows": rows}
+    command += "".join(f" --flights {name}" for name in flights) + f" --out {out.name}"
+    found = {"command": command, "summary": summary(rows), "flights": flights, "rows": rows}
     text = json.dumps(found, indent=1)
-    arguments.out.write_text(text + "\n", encoding="utf-8")
+    out.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -11,9 +11,11 @@ import pytest
 from openjax.gap import selection
 from openjax.gap.channels import of_flights
 from openjax.gap.criteria import Gaps, clearly_larger, departs, difference, growth, practical, worse
+from openjax.gap.model import hypotheses
 from openjax.gap.model.cross_validation import Validation
-from openjax.gap.model.library import ABSENT, places
+from openjax.gap.model.library import ABSENT, PLACE, places
 from openjax.gap.selection import Hypothesis
+from openjax.vehicle import load_vehicle
 from openjax.vehicle.effects.thrust_curve import bend
 
 
@@ -161,3 +163,24 @@ def test_a_plane_whose_place_is_not_known_acts_if_its_push_is():
     assert practical(fit)
     weak = of_one_effect("ground_effect", (0.05, 0.012), covariance)
     assert not practical(weak)
+
+
+@pytest.mark.parametrize(("alone", "begins"), [(-14.0, 0.4), (0.6, 0.6)])
+def test_an_effect_that_alone_is_forbidden_begins_at_its_start(monkeypatch, alone, begins):
+    """Where rotors differ a floor alone takes what it can of that, and pulls: beside them
+    it is searched from its start.
+    """
+
+    def fit(replay, effects, start, iterations=1):
+        theta = start.copy()
+        if iterations:
+            theta[PLACE["ground_effect", "strength"]] = alone
+        return SimpleNamespace(theta=theta)
+
+    start = ABSENT.copy()
+    start[places(("ground_effect",))] = 0.4, 0.012
+    monkeypatch.setattr(hypotheses, "fit_set", fit)
+    monkeypatch.setattr(hypotheses, "_best_start", lambda *_: start)
+    replay = SimpleNamespace(other_sizes={}, physics=SimpleNamespace(vehicles=(load_vehicle(),)))
+    single = hypotheses.fit_single(replay, "ground_effect")
+    assert single.theta[PLACE["ground_effect", "strength"]] == begins

@@ -11,10 +11,10 @@ import pytest
 
 from openjax.commands.sample_flights import SampleFlightsCommand, make_case
 from openjax.gap.channels import Estimated
-from openjax.gap.diagnosis import _runner_up, forbidden
+from openjax.gap.diagnosis import _runner_up
 from openjax.gap.folders import diagnose_folder
 from openjax.gap.intervals import _estimate
-from openjax.gap.model.library import ABSENT, PLACE
+from openjax.gap.model.library import ABSENT, PLACE, forbidden
 from openjax.gap.planning.beliefs import sentence
 from openjax.gap.probabilities import agreeing
 from openjax.gap.reference import trimmed_before

@@ -14,7 +14,7 @@ from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence, gather, with_identification
 from openjax.gap.intervals import estimates, links
 from openjax.gap.model.bounds import BOUND
-from openjax.gap.model.library import ABSENT, CARDS, PLACE, library, path_of
+from openjax.gap.model.library import ABSENT, CARDS, PLACE, forbidden, library, path_of
 from openjax.gap.planning.beliefs import acts_in_physics
 from openjax.gap.probabilities import agreeing, probabilities
 from openjax.gap.reference import OF_DAYS, borne_out, differs, join, read_reference, trimmed_before
@@ -137,24 +137,6 @@ def agreed(evidence: Evidence) -> tuple[Evidence, Selection]:
         return evidence, selection
     evidence = evidence.with_torques(beside)
     return evidence, select(evidence)
-
-
-def forbidden(theta: np.ndarray, effects: Iterable[str], vehicle) -> set[str]:
-    """Those of the motion's `effects` that do nothing once their parameters, as in theta
-    (P,), are brought to where physics allows them: drag that pushes, a battery that makes
-    more thrust the emptier it is.
-    """
-
-    def acts(effect: str) -> bool:
-        for entry in CARDS[effect].fitted:
-            parameter = EFFECTS[effect].parameters[entry.name]
-            least, most = parameter.limits(vehicle)
-            value = np.clip(theta[PLACE[effect, entry.name]], least, most)
-            if entry.name not in CARDS[effect].shape and value != parameter.none:
-                return True
-        return False
-
-    return {effect for effect in effects if not acts(effect)}
 
 
 def worth_naming(

@@ -13,7 +13,16 @@ import numpy as np
 from jaxtyping import Float
 
 from openjax.background import side_by_side
-from openjax.gap.model.library import ABSENT, CARDS, PLACE, Library, absent_beside, places, prior
+from openjax.gap.model.library import (
+    ABSENT,
+    CARDS,
+    PLACE,
+    Library,
+    absent_beside,
+    forbidden,
+    places,
+    prior,
+)
 from openjax.gap.model.replay import GROUPS, SKIP, Replay, block_count
 from openjax.gap.model.whitening import fit_noise
 from openjax.gap.shapes import Parameters, Rows
@@ -227,8 +236,16 @@ def fit_singles(replay: Replay, effects: Sequence[str]) -> dict[str, SetFit]:
 
 
 def fit_single(replay: Replay, effect: str) -> SetFit:
-    """The fit of one effect, alone but for what other estimators told."""
-    return fit_set(replay, in_order((effect, *replay.other_sizes)), _best_start(replay, effect))
+    """The fit of one effect, alone but for what other estimators told. One that alone takes
+    what physics forbids, as a floor that pulls where rotors differ, stays at its start:
+    beside the others it is searched from there.
+    """
+    effects = in_order((effect, *replay.other_sizes))
+    start = _best_start(replay, effect)
+    fit = fit_set(replay, effects, start)
+    if forbidden(fit.theta, (effect,), replay.physics.vehicles[0]):
+        return fit_set(replay, effects, start, iterations=0)
+    return fit
 
 
 def in_order(effects: Collection[str]) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ start, what is plausible.
 Priors are weak: their spread is of the order of the effect's usual range.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -135,6 +136,24 @@ def prior(
         means.append(mean)
         blocks.append(np.linalg.inv(covariance))
     return np.array(index, int), np.concatenate([np.zeros(0), *means]), block_diagonal(blocks)
+
+
+def forbidden(theta: np.ndarray, effects: Iterable[str], vehicle) -> set[str]:
+    """Those of the motion's `effects` that do nothing once their parameters, as in theta
+    (P,), are brought to where physics allows them: drag that pushes, a battery that makes
+    more thrust the emptier it is.
+    """
+
+    def acts(effect: str) -> bool:
+        for entry in CARDS[effect].fitted:
+            parameter = EFFECTS[effect].parameters[entry.name]
+            least, most = parameter.limits(vehicle)
+            value = np.clip(theta[PLACE[effect, entry.name]], least, most)
+            if entry.name not in CARDS[effect].shape and value != parameter.none:
+                return True
+        return False
+
+    return {effect for effect in effects if not acts(effect)}
 
 
 def _usual_covariance(card: Card) -> np.ndarray:
