@@ -62,7 +62,6 @@ ROWS = {
     "100 Hz means, 4 ms late": Rows(100, late=0.004),
     "100 Hz means, 6 ms late": Rows(100, late=0.006),
     "100 Hz means, 8 ms late": Rows(100, late=0.008),
-    "100 Hz means, 12 ms late": Rows(100, late=0.012),
 }
 TOLD = NAMES[:8]
 
