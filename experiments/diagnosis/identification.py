@@ -1,6 +1,6 @@
-"""What an identification of torques makes of flights with known truth: rows of 100, 250
-and 500 Hz, means and samples, motors logged in time and late, calm air and strong
-gusts; and of folders of real flights, where only the simulator's numbers stand beside.
+"""What an identification of torques makes of flights with known truth: rows of 100, 250 and 500 Hz,
+means and samples, motors logged in time and late, calm air and strong gusts; and of folders of real
+flights, where only the simulator's numbers stand beside.
 
     python -m experiments.diagnosis.identification --out experiments/results/identification.json
 """
@@ -42,8 +42,8 @@ VEHICLES = BRUSHED | {
 
 
 class Rows(NamedTuple):
-    """How a flight is logged: rate, Hz; whether motors are samples; whether what is new in
-    a row may act on its end; of how many flights; s by which motors are logged late.
+    """How a flight is logged: rate, Hz; whether motors are samples; whether what is new in a row
+    may act on its end; of how many flights; s by which motors are logged late.
     """
 
     rate: int
@@ -92,9 +92,7 @@ def truth_of(truth: Truth) -> np.ndarray:
 
 
 def flown() -> tuple[list[tuple], tuple]:
-    """(vehicle, gusts, number) of each flight, and all flights' gyroscopes and
-    motors.
-    """
+    """(vehicle, gusts, number) of each flight, and all flights' gyroscopes and motors."""
     cases = list(itertools.product(VEHICLES, GUSTS, range(SEEDS)))
     # Each flight has air of its own, so that their errors are independent.
     truths = [
@@ -142,9 +140,7 @@ def study(kinds: list[str]) -> list[dict]:
 
 
 def told(fits: list[TorqueFit], right: np.ndarray) -> dict:
-    """The mean of several fits beside what is right (8,), and how often their intervals
-    hold it.
-    """
+    """The mean of several fits beside what is right (8,), and how often their intervals hold it."""
     values = np.array([f.value[:8] for f in fits])
     deviations = np.array([np.sqrt(np.diag(f.covariance))[:8] for f in fits])
     inside = np.abs(values - right) < 1.645 * deviations
@@ -157,8 +153,8 @@ def told(fits: list[TorqueFit], right: np.ndarray) -> dict:
 
 
 def summary(rows: list[dict]) -> dict:
-    """Of each kind of rows: root mean squares of the logarithms of lag and gain over
-    the truth, and how often 90 % intervals hold it.
+    """Of each kind of rows: root mean squares of the logarithms of lag and gain over the truth, and
+    how often 90 % intervals hold it.
     """
     found = {}
     for kind in dict.fromkeys(r["rows"] for r in rows):
@@ -191,9 +187,7 @@ def _inside(rows: list[dict]) -> float:
 
 
 def of_flights(folder: Path) -> dict:
-    """What a case's flights say, and the share of the simulator's response that they
-    show.
-    """
+    """What a case's flights say, and the share of the simulator's response that they show."""
     found = identify(load_case(folder))
     shares = {f"{f:g} Hz": [round(v, 3) for v in found.at(f)] for f in (2.0, 5.0, 10.0)}
     quantities = {

@@ -142,7 +142,7 @@ def whole(out: Path) -> dict | None:
 def study(options: argparse.Namespace) -> dict:
     """All runs; they are stored after each, for `--report`."""
     path = options.out.with_suffix(".json")
-    runs = read_json(path)["runs"] if options.go_on else []
+    runs = read_json(path)["runs"] if options.go_on and path.exists() else []
     results = {"note": options.note, "runs": runs}
     with tempfile.TemporaryDirectory() as folder:
         options.cache = options.cache or Path(folder)
@@ -178,31 +178,11 @@ def page(results: dict) -> Page:
         "most crash": "whole.most:.2f",
     }
     prose = f"Uniform validation tasks. An update is the median of a run's. {results['note']}"
-    prose += medians(rows)
     goals = [
         goal for goal in results.get("goals", []) if "evaders.md" not in goal["page or command"]
     ]
     short = Table({name: name for name in ("figure", "goal", "value")}, goals)
     return Page("Seconds to a policy that catches", prose, Table(columns, rows, "Runs"), short)
-
-
-def medians(rows: list[dict]) -> str:
-    """A sentence for each start that three runs or more caught from, with all or nothing kept."""
-    prose = ""
-    for start in dict.fromkeys(run["start"] for run in rows):
-        for cached in ("all", "nothing"):
-            runs = [
-                run
-                for run in rows
-                if (run["start"], run["kept"]) == (start, cached) and run["validations"][1:]
-            ]
-            seconds = [run["reached"]["seconds"] if run["reached"] else np.inf for run in runs]
-            if len(runs) > 2 and np.isfinite(np.median(seconds)):
-                prose += (
-                    f" `{start}` with {cached} kept: {np.median(seconds):.1f} s in the median of "
-                    f"{len(runs)} runs."
-                )
-    return prose
 
 
 def main(arguments: list[str]) -> int:
