@@ -194,15 +194,23 @@ def test_advice_is_said_without_units_of_evidence():
     assert "nats" not in words and "nothing" not in words
 
 
+@pytest.fixture(scope="module")
+def before(tmp_path_factory):
+    """Flights of another day, on which nothing was wrong."""
+    folder = tmp_path_factory.mktemp("flights") / "before"
+    make_case(SampleFlightsCommand(folder, seed=1))
+    return folder
+
+
 @pytest.mark.slow
-def test_reports_of_flights_with_every_effect_agree_with_themselves(tmp_path):
+@pytest.mark.parametrize("effect", ("none", *EFFECTS))
+def test_reports_of_flights_with_every_effect_agree_with_themselves(tmp_path, before, effect):
     """What is generated, not made up: a report of each effect, alone and with another
     day's flights as the reference.
     """
-    make_case(SampleFlightsCommand(tmp_path / "before", seed=1))
-    for number, effect in enumerate(("none", *EFFECTS)):
-        make_case(SampleFlightsCommand(tmp_path / effect, effect=(effect,), seed=2 + number))
-        # every fourth beside another day, too
-        days = [(), (tmp_path / "before",)]
-        for reference in days[: 1 + (number % 4 == 0)]:
-            assert broken_rules(diagnose_folder(tmp_path / effect, reference)) == []
+    number = ("none", *EFFECTS).index(effect)
+    make_case(SampleFlightsCommand(tmp_path / effect, effect=(effect,), seed=2 + number))
+    # every fourth beside another day, too
+    days = [(), (before,)]
+    for reference in days[: 1 + (number % 4 == 0)]:
+        assert broken_rules(diagnose_folder(tmp_path / effect, reference)) == []
