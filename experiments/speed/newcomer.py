@@ -70,7 +70,7 @@ def learned_steps_a_second(name: str) -> float:
     import torch
     from stable_baselines3 import PPO
 
-    torch.set_num_threads(1)  # threads of its own make so small networks fifteen times as slow
+    torch.set_num_threads(1)  # two of its own take so small networks several times as long
     model = PPO("MlpPolicy", gymnasium.make(name), device="cpu", seed=0)
     model.learn(model.n_steps)  # compiles
     began = time.perf_counter()
