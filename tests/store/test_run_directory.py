@@ -11,7 +11,15 @@ import pytest
 
 from openjax.errors import UserError
 from openjax.learning import preset
-from openjax.store.run_directory import check_free, create_run, lock_run, open_run
+from openjax.store.run_directory import (
+    EFFECTS_FILE,
+    EVADER_FILE,
+    VEHICLE_FILE,
+    check_free,
+    create_run,
+    lock_run,
+    open_run,
+)
 
 HOLD = """
 import sys, time
@@ -63,6 +71,9 @@ def test_overwrite_replaces_the_run_and_keeps_foreign_files(tmp_path):
     run.write_settings({}, {})
     (run.checkpoints / "000000001").mkdir(parents=True)
     (run.path / "notes.txt").write_text("mine")
+    # a resumed run would take up the old one's game
+    for name in (VEHICLE_FILE, EFFECTS_FILE, EVADER_FILE):
+        (run.path / name).write_text("")
     create_run(run.path, overwrite=True)
     assert [path.name for path in run.path.iterdir()] == ["notes.txt"]
 

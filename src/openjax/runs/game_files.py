@@ -8,13 +8,13 @@ from openjax.pursuit import Pursuit, PursuitSettings
 from openjax.pursuit.evaders import Evader
 from openjax.runs.train_command import TrainCommand
 from openjax.store.environments import is_evader_file, make_environment
-from openjax.store.run_directory import RunDirectory
+from openjax.store.run_directory import (
+    EFFECTS_FILE,
+    EVADER_FILE,
+    VEHICLE_FILE,
+    RunDirectory,
+)
 from openjax.vehicle.vehicle_file import copy_vehicle_file, load_vehicle_file
-
-VEHICLE = "vehicle.toml"
-EFFECTS = "effects.toml"
-EVADER = "evader.npz"
-"""Their names in a run's directory."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class GameFiles:
             return old_run and old_run.optional(name)
 
         return cls(
-            command.vehicle or kept(VEHICLE),
-            command.effects or kept(EFFECTS),
-            command.opponent or kept(EVADER),
+            command.vehicle or kept(VEHICLE_FILE),
+            command.effects or kept(EFFECTS_FILE),
+            command.opponent or kept(EVADER_FILE),
         )
 
     @property
@@ -52,8 +52,8 @@ class GameFiles:
         name, is in its settings; a function is in no file.
         """
         if self.vehicle and load_vehicle_file(self.vehicle).path is not None:
-            copy_vehicle_file(self.vehicle, directory / VEHICLE)
+            copy_vehicle_file(self.vehicle, directory / VEHICLE_FILE)
         if self.effects:
-            shutil.copyfile(self.effects, directory / EFFECTS)
+            shutil.copyfile(self.effects, directory / EFFECTS_FILE)
         if is_evader_file(self.evader):
-            shutil.copyfile(self.evader, directory / EVADER)
+            shutil.copyfile(self.evader, directory / EVADER_FILE)

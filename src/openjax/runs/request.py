@@ -15,11 +15,10 @@ from openjax.errors import UserError
 from openjax.learning import TrainSettings, preset
 from openjax.pursuit import Pursuit
 from openjax.ranges import check_intervals
-from openjax.runs.game_files import EVADER
 from openjax.runs.train_command import MAY_CHANGE, PROGRAM, TrainCommand
 from openjax.runs.words import different_settings
 from openjax.store.policies import known_policies
-from openjax.store.run_directory import open_run, read_config
+from openjax.store.run_directory import EVADER_FILE, open_run, read_config
 
 
 def read_command(arguments: Sequence[str]) -> TrainCommand:
@@ -90,7 +89,8 @@ def check_resumed(command: TrainCommand, stored_settings: TrainSettings) -> None
     if command.overwrite:
         raise UserError("--resume and --overwrite exclude each other")
     options = ["start_from", "effects", "vehicle", "opponent"]
-    if "own" in stored_settings.environment.evaders and open_run(resume).optional(EVADER) is None:
+    evader = open_run(resume).optional(EVADER_FILE)
+    if "own" in stored_settings.environment.evaders and evader is None:
         options.remove("opponent")  # a function isn't in the run's files
     changes = [name for name in options if getattr(command, name) is not None]
     for name in (*changes, *different_settings(command.settings, stored_settings)):

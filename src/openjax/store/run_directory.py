@@ -2,7 +2,7 @@
 accident.
 
 settings.json      everything that determines the run; a policy or checkpoint needs nothing else
-vehicle.toml, effects.toml   copies of what it flew with, if not the nominal vehicle
+vehicle.toml, effects.toml, evader.npz   copies of what it flew with and against, if not the nominal
 metrics.jsonl, tensorboard/  the logs
 checkpoints/       whole training states: the last ones and the best by the validation tasks
 policy_start.npz, policy.npz  the policy before training and the best one
@@ -35,10 +35,14 @@ from openjax.plain import from_plain
 
 _FORMAT = "openjax run 1"
 SETTINGS_FILE = "settings.json"
+VEHICLE_FILE = "vehicle.toml"
+EFFECTS_FILE = "effects.toml"
+EVADER_FILE = "evader.npz"
 _FILES = (
     SETTINGS_FILE,
-    "vehicle.toml",
-    "effects.toml",
+    VEHICLE_FILE,
+    EFFECTS_FILE,
+    EVADER_FILE,
     "metrics.jsonl",
     "policy_start.npz",
     "policy.npz",
@@ -78,7 +82,7 @@ class RunDirectory:
         return self.path / "policy.npz"
 
     def optional(self, name: str) -> Path | None:
-        """A file of the run if it's there: `vehicle.toml` or `effects.toml`."""
+        """A file of the run if it's there: of the vehicle, the effects or the evader."""
         path = self.path / name
         return path if path.exists() else None
 
