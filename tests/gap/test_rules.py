@@ -3,6 +3,7 @@ a diagnosis says is brought to keep them.
 """
 
 import dataclasses
+import functools
 from types import SimpleNamespace
 
 import numpy as np
@@ -111,6 +112,18 @@ def test_what_has_no_share_or_makes_predictions_worse_is_not_named():
     assert set(worth_naming(shares_of, list(shares)).effects) == {"mass"}
     assert set(worth_naming(shares_of, ["inertia"]).effects) == {"inertia"}
     assert worth_naming(shares_of, ["wind"]).effects == {}
+
+
+def test_what_takes_a_part_of_one_channel_alone_is_named():
+    shares = {"motor_imbalance": (0.98, (0.97, 0.99)), "wind": (0.016, (0.01, 0.02))}
+
+    def shares_of(named, of_a_channel):
+        parts = split({e: shares[e] for e in named}, GAP)
+        return dataclasses.replace(parts, of_a_channel=of_a_channel)
+
+    for part, named in ((0.9, {"motor_imbalance", "wind"}), (0.01, {"motor_imbalance"})):
+        told = worth_naming(functools.partial(shares_of, of_a_channel={"wind": part}), list(shares))
+        assert set(told.effects) == named
 
 
 def test_nobody_who_logged_one_vehicle_is_sent_for_a_second():

@@ -5,7 +5,7 @@ import pytest
 
 from openjax.gap.decision import DECISION
 from openjax.gap.probabilities import probabilities
-from openjax.gap.shares import shares_of_squares
+from openjax.gap.shares import shares_of_channels, shares_of_squares
 
 RNG = np.random.default_rng(0)
 
@@ -23,6 +23,22 @@ def test_one_part_alone_has_all_that_is_explained():
     assert values[0] == pytest.approx([1.0 - 0.1 / 8.0, 0.0, 0.1 / 8.0]) and square[
         0
     ] == pytest.approx([9.0, 1.1])
+
+
+def test_a_wind_beside_rotors_that_differ_takes_the_whole_of_one_channel_and_little_of_all():
+    """Rates are 900 floors off by the rotors, velocity is 9 by the wind: the first row has both
+    effects, the next ones none, none but the sensors, one without each part.
+    """
+    rates = [1.0, 901.0, 901.0, 901.0, 1.0, 1.0]
+    velocity = [1.0, 10.0, 10.0, 1.0, 10.0, 1.4]
+    squares = np.array([rates, velocity]).T[:, None]
+    values, _ = shares_of_squares(squares, np.ones((1, 1)), np.ones(2))
+    assert values[0, 1] < DECISION.form_error
+    of_channels = shares_of_channels(squares[:, 0], np.ones(2))
+    assert of_channels == pytest.approx(np.eye(2))
+    # less than a floor is none of it, however little else there is
+    weak = 1.0 + (squares[:, 0] - 1.0) * np.array([1.0, 0.1])
+    assert shares_of_channels(weak, np.ones(2))[1] == pytest.approx([0.0, 0.0])
 
 
 def test_without_a_gap_all_there_is_are_the_sensors():

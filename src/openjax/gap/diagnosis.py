@@ -146,7 +146,9 @@ def worth_naming(
 ) -> Split:
     """The shares of those of the `effects` that have one, and that make held-out
     predictions better; `shares_of` splits the gap. Of the motion's effects it must be
-    larger than errors of the others' forms. What other estimators named (`torque_effects`) stays:
+    larger than errors of the others' forms, of the whole gap or of one channel's: rotors that
+    differ turn the vehicle, and none of their errors is a wind's. What other estimators named
+    (`torque_effects`) stays:
     a lag hides from predictions over a quarter of a second, and not from who trains a
     policy with it.
     """
@@ -155,7 +157,7 @@ def worth_naming(
         dropouts = [
             e
             for e in optional
-            if parts.effects[e].interval90[1] < least_share(e)
+            if max(parts.effects[e].interval90[1], parts.of_a_channel.get(e, 0.0)) < least_share(e)
             or parts.effects[e].value < LEAST_SHARE
         ]
         if not dropouts and parts.gap.reduction < DECISION.least_gap:

@@ -10,7 +10,7 @@ others stay (its usefulness, Darlington 1968), in proportion to that of all part
 that shares add up to one with what is unexplained.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -97,6 +97,10 @@ class Split:
     """{part: share of the bootstrap's draws in which it is the largest}, of effects and
     "unexplained".
     """
+    of_a_channel: dict[str, float] = field(default_factory=dict)
+    """{effect: the largest part that it takes of one channel's gap}: what turns a vehicle all
+    the time hides a wind from the whole, and not from the velocity.
+    """
 
 
 def split(
@@ -131,7 +135,22 @@ def split(
         sensors=shares["sensors"],
         unexplained=shares["unexplained"],
         largest=largest,
+        of_a_channel=dict(
+            zip(effects, shares_of_channels(squares.mean(1), floor_shares).max(1), strict=True)
+        ),
     )
+
+
+def shares_of_channels(
+    squares: Float[np.ndarray, "sets channels"], floor_share: Float[np.ndarray, " channels"]
+) -> Float[np.ndarray, "effects channels"]:
+    """The part that each effect takes of each channel's gap, of the squares and floors that
+    `shares_of_squares` takes; none of less than a floor.
+    """
+    level = squares / (squares[:1] * floor_share + 1e-30)
+    useful = level[3:-1] - level[0]
+    whole = np.maximum(level[1:3].max(0) - 1.0, 1.0)
+    return np.where(useful >= 1.0, useful / whole, 0.0)
 
 
 def shares_of_squares(
