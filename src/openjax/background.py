@@ -7,6 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import jax
+from threadpoolctl import threadpool_limits
 
 MOST = 2
 """Threads that compute side by side: beyond, they wait for the interpreter."""
@@ -25,6 +26,13 @@ def side_by_side(function: Callable, items: Iterable) -> list:
         return [function(item) for item in items]
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(function, items))
+
+
+one_blas_thread = threadpool_limits.wrap(limits=1, user_api="blas")
+"""Decorates a function in which NumPy and SciPy compute each product on one core. Of products as
+small as a diagnosis', threads wait for each other for longer than they compute: beside other work
+one took 80 s with them and 20 s without.
+"""
 
 
 class Pending:

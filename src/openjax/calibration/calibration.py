@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from openjax.background import one_blas_thread
 from openjax.errors import UserError
 from openjax.flights.flight import Case
 from openjax.gap.channels import robust_deviation
@@ -117,6 +118,7 @@ class Calibration:
         }
 
 
+@one_blas_thread
 def calibrate(case: Case) -> Calibration:
     """Fit thrust constant, torque constant, motor time constant and inertia to a case's
     flights.

@@ -8,6 +8,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 
+from openjax.background import one_blas_thread
 from openjax.flights.flight import Case
 from openjax.gap.criteria import DETECTABLE
 from openjax.gap.decision import DECISION
@@ -28,6 +29,7 @@ from openjax.gap.where import locate
 from openjax.vehicle.effects import EFFECTS
 
 
+@one_blas_thread
 def diagnose_case(
     case: Case,
     without: Iterable[str] = (),

@@ -15,6 +15,7 @@ from functools import lru_cache
 import jax
 import numpy as np
 
+from openjax.background import one_blas_thread
 from openjax.flights.flight import Case
 from openjax.flights.reading import flights_of
 from openjax.flights.samples import Turbulence, fly, log_of
@@ -70,6 +71,7 @@ class Advice:
     """{(cause, other): nats of the best segment}."""
 
 
+@one_blas_thread
 def advise(beliefs: list[Belief], vehicle_file: VehicleFile) -> Advice:
     """Rank all segments by what they are expected to tell."""
     replay = replay_segments(nominal_of(vehicle_file))
