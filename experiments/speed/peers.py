@@ -124,6 +124,7 @@ CASES = {
         options, PursuitMultiAgentEnv(), restarts=False
     ),
     "JaxMARL, simple_tag without restarts": lambda options: jaxmarl_tag(options, restarts=False),
+    "by hand, recovery": lambda options: recovery.controller(options.learning_worlds),
     "Brax's PPO, recovery": lambda options: recovery.brax_ppo(
         options.learning_steps, options.learning_worlds
     ),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.speed.recovery import SIZE, RecoveryEnv, recover, see, tumble
+from experiments.speed.recovery import HOLDS, SIZE, RecoveryEnv, controller, recover, see, tumble
 
 BLOCK = """
 import sys
@@ -33,6 +33,10 @@ def test_a_drone_is_held_where_it_hovers_at_the_goal():
     assert bool(held) and reward > 0.9
 
 
+def test_what_is_asked_of_learners_can_be_done():
+    assert HOLDS + 0.05 < controller(64)["held"] < 0.5
+
+
 def test_gymnasium_environment_ends_by_its_time():
     env = RecoveryEnv()
     env.reset(seed=0)
@@ -48,4 +52,4 @@ def test_what_is_not_installed_is_left_out_with_a_line(tmp_path):
     )
     assert done.stdout.count(": left out, ") == 6
     rows = json.loads(file.read_text())["rows"]
-    assert {name.partition(",")[0] for name in rows} == {"openjax"} and len(rows) == 4
+    assert {name.partition(",")[0] for name in rows} == {"openjax", "by hand"} and len(rows) == 5
