@@ -122,8 +122,15 @@ def test_what_takes_a_part_of_one_channel_alone_is_named():
         return dataclasses.replace(parts, of_a_channel=of_a_channel)
 
     for part, named in ((0.9, {"motor_imbalance", "wind"}), (0.01, {"motor_imbalance"})):
-        told = worth_naming(functools.partial(shares_of, of_a_channel={"wind": part}), list(shares))
+        told = worth_naming(
+            functools.partial(shares_of, of_a_channel={"wind": ("velocity x", part)}), list(shares)
+        )
         assert set(told.effects) == named
+    told = shares_of(
+        list(shares), {"wind": ("velocity x", 0.9), "motor_imbalance": ("rates x", 1.0)}
+    )
+    assert told.in_words("wind", "wind") == "wind 0.02 [0.01, 0.02], 0.90 of velocity x"
+    assert told.in_words("motor_imbalance", "rotors") == "rotors 0.98 [0.97, 0.99]"
 
 
 def test_nobody_who_logged_one_vehicle_is_sent_for_a_second():

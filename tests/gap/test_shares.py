@@ -34,11 +34,11 @@ def test_a_wind_beside_rotors_that_differ_takes_the_whole_of_one_channel_and_lit
     squares = np.array([rates, velocity]).T[:, None]
     values, _ = shares_of_squares(squares, np.ones((1, 1)), np.ones(2))
     assert values[0, 1] < DECISION.form_error
-    of_channels = shares_of_channels(squares[:, 0], np.ones(2))
-    assert of_channels == pytest.approx(np.eye(2))
+    channels, parts = shares_of_channels(squares[:, 0], np.ones(2))
+    assert channels.tolist() == [0, 1] and parts == pytest.approx([1.0, 1.0])
     # less than a floor is none of it, however little else there is
     weak = 1.0 + (squares[:, 0] - 1.0) * np.array([1.0, 0.1])
-    assert shares_of_channels(weak, np.ones(2))[1] == pytest.approx([0.0, 0.0])
+    assert shares_of_channels(weak, np.ones(2))[1] == pytest.approx([1.0, 0.0])
 
 
 def test_without_a_gap_all_there_is_are_the_sensors():

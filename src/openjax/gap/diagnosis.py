@@ -150,17 +150,15 @@ def worth_naming(
     predictions better; `shares_of` splits the gap. Of the motion's effects it must be
     larger than errors of the others' forms, of the whole gap or of one channel's: rotors that
     differ turn the vehicle, and none of their errors is a wind's. What other estimators named
-    (`torque_effects`) stays:
-    a lag hides from predictions over a quarter of a second, and not from who trains a
-    policy with it.
+    (`torque_effects`) stays: a lag hides from predictions over a quarter of a second, and not
+    from who trains a policy with it.
     """
     parts = shares_of(effects)
     while optional := [e for e in effects if e not in torque_effects]:
         dropouts = [
             e
             for e in optional
-            if max(parts.effects[e].interval90[1], parts.of_a_channel.get(e, 0.0)) < least_share(e)
-            or parts.effects[e].value < LEAST_SHARE
+            if parts.reach(e) < least_share(e) or parts.effects[e].value < LEAST_SHARE
         ]
         if not dropouts and parts.gap.reduction < DECISION.least_gap:
             dropouts = [min(optional, key=lambda e: parts.effects[e].value)]

@@ -13,7 +13,7 @@ that shares add up to one with what is unexplained.
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.stats import norm
 
 from openjax.gap.decision import DECISION
@@ -97,10 +97,25 @@ class Split:
     """{part: share of the bootstrap's draws in which it is the largest}, of effects and
     "unexplained".
     """
-    of_a_channel: dict[str, float] = field(default_factory=dict)
-    """{effect: the largest part that it takes of one channel's gap}: what turns a vehicle all
-    the time hides a wind from the whole, and not from the velocity.
+    of_a_channel: dict[str, tuple[str, float]] = field(default_factory=dict)
+    """{effect: a channel and the part that it takes of that one's gap, its largest}: what turns a
+    vehicle all the time hides a wind from the whole, and not from the velocity.
     """
+
+    def reach(self, effect: str) -> float:
+        """The part that an effect may take, of the whole gap or of one channel's."""
+        _, of_a_channel = self.of_a_channel.get(effect, ("", 0.0))
+        return max(self.effects[effect].interval90[1], of_a_channel)
+
+    def in_words(self, effect: str, name: str) -> str:
+        """An effect's share with its interval, and where that is small the channel for which it
+        is named.
+        """
+        share = self.effects[effect]
+        low, high = share.interval90
+        text = f"{name} {share.value:.2f} [{low:.2f}, {high:.2f}]"
+        channel, part = self.of_a_channel.get(effect, ("", 0.0))
+        return f"{text}, {part:.2f} of {channel}" if high < DECISION.form_error < part else text
 
 
 def split(
@@ -135,22 +150,28 @@ def split(
         sensors=shares["sensors"],
         unexplained=shares["unexplained"],
         largest=largest,
-        of_a_channel=dict(
-            zip(effects, shares_of_channels(squares.mean(1), floor_shares).max(1), strict=True)
-        ),
+        of_a_channel={
+            effect: (channels[channel], float(part))
+            for effect, channel, part in zip(
+                effects, *shares_of_channels(squares.mean(1), floor_shares), strict=True
+            )
+        },
     )
 
 
 def shares_of_channels(
     squares: Float[np.ndarray, "sets channels"], floor_share: Float[np.ndarray, " channels"]
-) -> Float[np.ndarray, "effects channels"]:
-    """The part that each effect takes of each channel's gap, of the squares and floors that
-    `shares_of_squares` takes; none of less than a floor.
+) -> tuple[Int[np.ndarray, " effects"], Float[np.ndarray, " effects"]]:
+    """Of each effect, of the channels of which it takes a part that counts, the one in which it
+    does most; and that part, of the squares and floors that `shares_of_squares` takes. What does
+    less than a floor takes none.
     """
     level = squares / (squares[:1] * floor_share + 1e-30)
     useful = level[3:-1] - level[0]
     whole = np.maximum(level[1:3].max(0) - 1.0, 1.0)
-    return np.where(useful >= 1.0, useful / whole, 0.0)
+    parts = np.where(useful >= 1.0, np.minimum(useful / whole, 1.0), 0.0)
+    most = np.argmax(np.where(parts >= DECISION.form_error, useful, parts), 1)
+    return most, np.take_along_axis(parts, most[:, None], 1)[:, 0]
 
 
 def shares_of_squares(

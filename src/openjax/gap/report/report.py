@@ -213,6 +213,7 @@ class Report:
         """`report.json`: every field but the pictures' arrays, numbers rounded."""
         shares = {
             "effects": self.shares.effects,
+            "of_a_channel": self.shares.of_a_channel,
             "sensors": self.shares.sensors,
             "unexplained": self.shares.unexplained,
         }
@@ -303,11 +304,7 @@ class Report:
         """Every named class' share with its interval, then sensors and clocks, then
         what is unexplained.
         """
-        parts = {self.class_of(e): self.shares.effects[e] for e in self.named}
-        rows = [
-            f"{name} {share.value:.2f} [{share.interval90[0]:.2f}, {share.interval90[1]:.2f}]"
-            for name, share in parts.items()
-        ]
+        rows = [self.shares.in_words(e, self.class_of(e)) for e in self.named]
         rows.append(f"sensors and clocks {self.shares.sensors.value:.2f}")
         rows.append(f"unexplained {self.shares.unexplained.value:.2f}")
         return f"Shares of the gap: {'; '.join(rows)}."
