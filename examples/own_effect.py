@@ -26,8 +26,7 @@ tether = Effect(
     parameters={"weight": Parameter("N/m", 0.0, (0.01, 0.05), "thin cables, 1 to 5 g a metre")},
     wrench=wrench,
     card=Card(
-        fitted=(Fitted("weight", mean=0.0, spread=0.03, start=0.01, step=0.0005),),
-        sample={"weight": 0.03},
+        fitted=(Fitted("weight", mean=0.0, spread=0.03, start=0.01, step=0.0005, sample=0.03),),
         next_flight="climb slowly to the ceiling and back.",
     ),
 )

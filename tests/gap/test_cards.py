@@ -2,6 +2,9 @@
 on.
 """
 
+import dataclasses
+from typing import get_args
+
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
@@ -12,6 +15,7 @@ from openjax.gap.model.bounds import BOUND, solve_bounded
 from openjax.gap.model.library import ABSENT, CARDS, STEP, THETA, places, prior
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.effects import EFFECTS
+from openjax.vehicle.effects.effect import Need, Scale
 
 
 @pytest.mark.parametrize("name", EFFECTS)
@@ -24,25 +28,21 @@ def test_a_card_is_complete(name):
         "rate_loop",
         "estimator",
     ) and card.next_flight.endswith(".")
-    assert {p.name for p in card.fitted} <= set(effect.parameters) and set(card.sample) <= set(
-        effect.parameters
-    )
+    assert {p.name for p in card.fitted} <= set(effect.parameters)
     assert all(p.spread > 0 and p.step > 0 for p in card.fitted)
     assert all(len(start) == len(card.fitted) for start in card.others)
-    sizes = (card.nuisance, card.nuisance_duty, card.nuisance_samples)
-    assert all(
-        set(s) <= set(effect.parameters) and all(callable(v) or v > 0 for v in s.values())
-        for s in sizes
-    )
+    sizes = [size for p in card.fitted for size in dataclasses.astuple(p.nuisance)]
+    assert all(size is None or callable(size) or size > 0 for size in sizes)
+    assert set(card.needs) <= set(get_args(Need)) and set(card.scales) <= set(get_args(Scale))
     assert card.log_odds < 0
-    assert set(card.coupling) <= {p.name for p in card.fitted} & set(card.practical)
+    assert all(p.practical is not None for p in card.fitted if p.coupling)
 
 
 def test_what_couples_axes_is_known_apart_from_the_moments():
     """A body that is heavier all over has no product of inertia for that."""
-    index, _, precision = prior(("inertia",))
+    _, _, precision = prior(("inertia",))
     covariance = np.linalg.inv(precision)
-    coupling = [THETA[i][1] in CARDS["inertia"].coupling for i in index]
+    coupling = [p.coupling for p in CARDS["inertia"].fitted]
     assert sum(coupling) == 1
     np.testing.assert_allclose(covariance[coupling][:, ~np.array(coupling)], 0, atol=1e-9)
 

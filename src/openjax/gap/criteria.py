@@ -103,11 +103,11 @@ def too_small(fit: SetFit) -> tuple[str, ...]:
 
     def of_a_size(effect: str) -> bool:
         card = CARDS[effect]
-        names = [p.name for p in card.fitted] if card.departure else list(card.practical)
-        if not names or effect in fit.replay.other_sizes:
+        parameters = [p for p in card.fitted if card.departure or p.practical is not None]
+        if not parameters or effect in fit.replay.other_sizes:
             return True
-        indices = [PLACE[effect, parameter] for parameter in names]
-        shape = [PLACE[effect, parameter] for parameter in card.shape]
+        indices = [PLACE[effect, p.name] for p in parameters]
+        shape = [PLACE[effect, p.name] for p in card.fitted if p.shape]
         free = np.flatnonzero(~np.isin(fit.index, shape))
         covariance = of_flights(
             np.linalg.inv(fit.hessian[np.ix_(free, free)]), fit.grams[:, 1:, 0][:, free]
@@ -117,7 +117,7 @@ def too_small(fit: SetFit) -> tuple[str, ...]:
         away = fit.theta[indices] - fit.replay.absent[indices]
         if card.departure:
             return departs(away, covariance[np.ix_(rows, rows)], card.departure())
-        least = np.array([card.practical[p] for p in names])
+        least = np.array([p.practical for p in parameters])
         least = least * fit.replay.size_factors[indices]
         return clearly_larger(away, covariance[np.ix_(rows, rows)], least)
 

@@ -31,7 +31,7 @@ def estimates(evidence: Evidence, fit: SetFit, effects) -> dict[str, dict[str, E
         (effect, p.name): (float(mean[k]), float(covariance[k, k]) ** 0.5)
         for effect, (mean, covariance) in evidence.replay.other_sizes.items()
         for k, p in enumerate(CARDS[effect].fitted)
-        if p.name not in CARDS[effect].coupling
+        if not p.coupling
     }
     out = {}
     for effect in effects:

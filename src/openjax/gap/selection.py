@@ -48,7 +48,7 @@ from openjax.gap.posterior import LARGEST
 NOTHING = frozenset()
 # What turns a vehicle all the time, which motors hold against.
 TRIMS = frozenset(
-    e for e, card in CARDS.items() if card.trim is not None and not card.scales_motion
+    e for e, card in CARDS.items() if card.trim is not None and "motion" not in card.scales
 )
 # Sets that are fitted in full, of those that the model promises as linearised around
 # nothing, and then around the best of these.
@@ -315,7 +315,7 @@ class Search:
         """
         sizes = range(LARGEST + 1)
         every = (self.torque_effects.union(s) for n in sizes for s in combinations(self.singles, n))
-        return [s for s in every if sum(CARDS[e].scales_motion for e in s) <= 1]
+        return [s for s in every if sum("motion" in CARDS[e].scales for e in s) <= 1]
 
     @property
     def best(self) -> Hypothesis:

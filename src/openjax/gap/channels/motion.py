@@ -32,6 +32,7 @@ from openjax.gap.model.prediction import RATES
 from openjax.gap.model.replay import Replay, make_replay
 from openjax.gap.model.wakes import Gusts, as_loud_as, fit_wake, read_gusts
 from openjax.vehicle.effects import EFFECTS
+from openjax.vehicle.effects.effect import Need
 
 # rows of a log in one of the grid's: if fewer are samples, their mean isn't what five
 # ticks of the loop did
@@ -74,11 +75,11 @@ class Reading:
         `library.numbers_of` has them: how far they are usually off depends on how
         motors were logged.
         """
-        situation = "nuisance"
+        situation = "always"
         if self.pwm:
-            situation = "nuisance_duty"
+            situation = "duty_cycles"
         elif self.blind:
-            situation = "nuisance_samples"
+            situation = "samples"
         usual = numbers_of(situation, self.vehicles[0])
         if self.reference:
             return with_days(usual, self.vehicles[0])
@@ -88,13 +89,17 @@ class Reading:
         keys = {number[:2] for number in reference_numbers}
         return (*reference_numbers, *(number for number in usual if number[:2] not in keys))
 
-    @property
-    def lacks_thrust_map(self) -> bool:
-        """True if the thrust of a motor command is unknown: for duty cycles without a reference, or
-        without the voltage that changes it.
-        """
-        volts = all(t.voltage is not None for t in self.tracks)
-        return self.pwm and (self.baseline is None or not volts) and not self.reference
+    def lacks(self, need: Need) -> bool:
+        """True if what an effect can't be told without isn't known of one of the flights."""
+        if need == "thrust_map":
+            # of duty cycles without a reference, or without the voltage that changes it
+            unknown = self.baseline is None or self.lacks("voltage")
+            return self.pwm and unknown and not self.reference
+        if need == "force":
+            # Torques alone tell a weaker push from nothing: heavier moments of inertia
+            # look the same.
+            return any(t.velocity is None and t.specific_force is None for t in self.tracks)
+        return any(getattr(t, need) is None for t in self.tracks)
 
     @property
     def firmware_tracks(self) -> list[Track]:
@@ -255,17 +260,10 @@ def _is_hidden(card, reading: Reading) -> bool:
     """True if an effect can't be told from these logs, however large it is: its channel is missing,
     or it looks like a nuisance, what motors do unseen or the map from duty cycles to thrust.
     """
-    if card.needs and any(getattr(t, card.needs) is None for t in reading.tracks):
-        return True
-    # Torques alone tell a weaker push from nothing: heavier moments of inertia look the
-    # same.
-    weightless = any(t.velocity is None and t.specific_force is None for t in reading.tracks)
-    if card.needs_force and weightless:
+    if any(map(reading.lacks, card.needs)) or (reading.blind and card.torque_axes):
         return True
     # of motors that were made of the commands torques tell nothing
-    if weightless and not all(t.motors_logged for t in reading.tracks):
-        return True
-    if (reading.blind and card.torque_axes) or (reading.lacks_thrust_map and card.thrust_map):
+    if reading.lacks("force") and not all(t.motors_logged for t in reading.tracks):
         return True
     return card.impossible is not None and any(
         t.ceiling is None and card.impossible(t.position) for t in reading.tracks

@@ -48,7 +48,7 @@ def corrections(identification: Identification, effects) -> tuple[dict, dict]:
     intervals: dict = {}
     numbers = _numbers(identification)
     lag_alone = identification.duty_cycles or any(
-        CARDS[effect].scales_torques for effect in effects if effect in CARDS
+        "torques" in CARDS[effect].scales for effect in effects if effect in CARDS
     )
     # yaw tells a torque over an inertia: where the inertia is named, that has all of it
     has_inertia = any(p.name == "zz" for e in effects if e in CARDS for p in CARDS[e].fitted)

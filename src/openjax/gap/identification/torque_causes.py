@@ -117,7 +117,7 @@ class Torques:
         """The same beside the thrust of parameters theta (P,), of which these `effects`
         were named.
         """
-        scaling = tuple(e for e in effects if CARDS[e].scales_torques or CARDS[e].scales_motion)
+        scaling = tuple(e for e in effects if CARDS[e].scales)
         if not scaling:
             return self
         slope = np.log(_thrust_slope(theta) / _thrust_slope(self.nominal))

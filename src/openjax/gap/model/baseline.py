@@ -69,13 +69,14 @@ def day_of(effect: str, parameter: str, vehicle, silent: bool) -> float:
     battery nobody logged.
     """
     card = CARDS[effect]
-    usual = card.nuisance.get(parameter, 0.0)
-    usual = float(usual(vehicle) if callable(usual) else usual)
-    common = card.common * (parameter not in card.coupling)
-    spread = np.hypot(next(p.spread for p in card.fitted if p.name == parameter), common)
+    entry = next(p for p in card.fitted if p.name == parameter)
+    usual = entry.nuisance.size("always", vehicle) or 0.0
+    spread = np.hypot(entry.spread, card.common * (not entry.coupling))
     spread *= growth(EFFECTS[effect].parameters[parameter].unit, vehicle)
-    charge = card.nuisance_duty.get(parameter, 0.0) if silent and card.thrust_map else 0.0
-    return max(charge, card.days or 0.0, FORM_DAYS * usual, DECISION.form_error * float(spread))
+    charge = entry.nuisance.duty_cycles if silent and "thrust_map" in card.needs else None
+    return max(
+        charge or 0.0, card.days or 0.0, FORM_DAYS * usual, DECISION.form_error * float(spread)
+    )
 
 
 def transfer(

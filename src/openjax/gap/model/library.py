@@ -15,7 +15,7 @@ from openjax.errors import UserError, suggestion
 from openjax.gap.model.blocks import block_diagonal
 from openjax.gap.shapes import Parameters
 from openjax.vehicle.effects import EFFECTS, Card
-from openjax.vehicle.effects.effect import growth
+from openjax.vehicle.effects.effect import Situation, growth
 
 # {effect: its card}: what can be diagnosed.
 CARDS: dict[str, Card] = {
@@ -23,14 +23,15 @@ CARDS: dict[str, Card] = {
 }
 
 
-def numbers_of(situation: str, vehicle) -> tuple[tuple[str, str, float], ...]:
+def numbers_of(situation: Situation, vehicle) -> tuple[tuple[str, str, float], ...]:
     """(effect, parameter, usual size) of small errors of a vehicle's numbers, which are
-    free in every hypothesis; `situation` is the field of `Card` that holds them.
+    free in every hypothesis.
     """
     return tuple(
-        (e, p, float(size(vehicle) if callable(size) else size))
+        (e, p.name, size)
         for e, card in CARDS.items()
-        for p, size in (card.nuisance | getattr(card, situation)).items()
+        for p in card.fitted
+        if (size := p.nuisance.size(situation, vehicle)) is not None
     )
 
 
@@ -149,7 +150,7 @@ def forbidden(theta: np.ndarray, effects: Iterable[str], vehicle) -> set[str]:
             parameter = EFFECTS[effect].parameters[entry.name]
             least, most = parameter.limits(vehicle)
             value = np.clip(theta[PLACE[effect, entry.name]], least, most)
-            if entry.name not in CARDS[effect].shape and value != parameter.none:
+            if not entry.shape and value != parameter.none:
                 return True
         return False
 
@@ -158,6 +159,6 @@ def forbidden(theta: np.ndarray, effects: Iterable[str], vehicle) -> set[str]:
 
 def _usual_covariance(card: Card) -> np.ndarray:
     """(p, p) of an effect's parameters, as its card says."""
-    common = [card.common * (p.name not in card.coupling) for p in card.fitted]
+    common = [card.common * (not p.coupling) for p in card.fitted]
     block = np.diag([p.spread**2 for p in card.fitted]) + np.outer(common, common)
     return block - BALANCE * block.mean() if card.balanced else block

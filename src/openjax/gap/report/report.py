@@ -358,7 +358,7 @@ class Report:
 
 def _scale_motion(effects: Collection[str]) -> bool:
     """True if one of the effects changes all accelerations in proportion."""
-    return any(CARDS[e].scales_motion for e in effects if e in CARDS)
+    return any("motion" in CARDS[e].scales for e in effects if e in CARDS)
 
 
 def _plain(value):

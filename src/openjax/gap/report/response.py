@@ -82,8 +82,8 @@ def moves(name: str, effects: Collection[str]) -> bool:
     if name.endswith("_trim"):
         return any(card.trim is not None for card in cards)
     if name.startswith("thrust"):
-        return any(card.scales_motion for card in cards)
-    return name.startswith(("inertia", "yaw")) and any(card.scales_torques for card in cards)
+        return any("motion" in card.scales for card in cards)
+    return name.startswith(("inertia", "yaw")) and any("torques" in card.scales for card in cards)
 
 
 def pictures_of(identification: Identification) -> list[tuple[str, str]]:

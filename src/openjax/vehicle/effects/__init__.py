@@ -17,7 +17,15 @@ from openjax.vehicle.effects.composition import (
     resolve,
     seen_state,
 )
-from openjax.vehicle.effects.effect import Card, Context, Effect, Fitted, Parameter, make_context
+from openjax.vehicle.effects.effect import (
+    Card,
+    Context,
+    Effect,
+    Fitted,
+    Nuisance,
+    Parameter,
+    make_context,
+)
 from openjax.vehicle.effects.effects_file import load_effects, save_effects
 from openjax.vehicle.effects.registry import EFFECTS, register_effect
 
@@ -27,6 +35,7 @@ __all__ = [
     "Context",
     "Effect",
     "Fitted",
+    "Nuisance",
     "Parameter",
     "complete_parameters",
     "initial_memory",

@@ -4,7 +4,15 @@ battery gives now.
 
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import NOT_NEGATIVE, RARE, Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import (
+    NOT_NEGATIVE,
+    RARE,
+    Card,
+    Effect,
+    Fitted,
+    Nuisance,
+    Parameter,
+)
 
 
 def voltage(parameters, context):
@@ -62,20 +70,23 @@ EFFECT = Effect(
     motor=motor,
     card=Card(
         fitted=(
-            Fitted("exponent", mean=0.0, spread=1.0, start=0.5, step=0.01),
-            Fitted("reference", mean=3.85, spread=0.15, start=3.85, step=0.01),
+            Fitted(
+                "exponent",
+                mean=0.0,
+                spread=1.0,
+                start=0.5,
+                step=0.01,
+                sample=1.0,
+                practical=0.1,
+                nuisance=Nuisance(duty_cycles=0.4),
+            ),
+            Fitted("reference", mean=3.85, spread=0.15, start=3.85, step=0.01, shape=True),
         ),
-        needs="voltage",
-        nuisance_duty={"exponent": 0.4},
+        needs=("voltage", "thrust_map"),
         coordinate="voltage",
-        thrust_map=True,
-        scales_torques=True,
-        scales_motion=True,
+        scales=("motion", "torques"),
         log_odds=RARE,
         at_voltage=frozen,
-        sample={"exponent": 1.0},
-        practical={"exponent": 0.1},
-        shape=("reference",),
         days=0.0,
         next_flight="the same hover on a full and on a nearly empty battery.",
     ),

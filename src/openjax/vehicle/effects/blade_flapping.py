@@ -45,17 +45,31 @@ EFFECT = Effect(
     wrench=wrench,
     card=Card(
         fitted=(
-            Fitted("tilt", mean=0.0, spread=0.02, start=0.005, step=0.0001),
-            Fitted("stiffness", mean=0.0, spread=0.0002, start=3e-05, step=1e-06),
+            Fitted(
+                "tilt",
+                mean=0.0,
+                spread=0.02,
+                start=0.005,
+                step=0.0001,
+                sample=0.02,
+                # as much force as the drag that matters: a smaller one stood in for small
+                # drags
+                practical=0.006,
+            ),
+            Fitted(
+                "stiffness",
+                mean=0.0,
+                spread=0.0002,
+                start=3e-05,
+                step=1e-06,
+                sample=0.0002,
+                practical=1e-05,
+            ),
         ),
-        needs="velocity",
+        needs=("velocity",),
         coordinate="body velocity",
         log_odds=VERY_RARE,
         possible=tilts_back,
-        sample={"tilt": 0.02, "stiffness": 0.0002},
-        # A tilt of as much force as the drag that matters: a smaller one stood in for
-        # small drags.
-        practical={"tilt": 0.006, "stiffness": 1e-05},
         next_flight="fast straight passes with sudden stops, to load roll and pitch.",
     ),
 )

@@ -46,17 +46,25 @@ EFFECT = Effect(
     thrust=thrust,
     card=Card(
         fitted=(
-            Fitted("strength", mean=0.0, spread=0.8, start=0.4, step=0.01),
-            Fitted("offset", mean=0.012, spread=0.025, start=0.012, step=0.0005, most=FARTHEST),
+            Fitted(
+                "strength", mean=0.0, spread=0.8, start=0.4, step=0.01, sample=0.6, practical=0.08
+            ),
+            Fitted(
+                "offset",
+                mean=0.012,
+                spread=0.025,
+                start=0.012,
+                step=0.0005,
+                most=FARTHEST,
+                sample=0.01,
+                shape=True,
+            ),
         ),
         others=((0.4, 0.0), (0.4, 0.025), (0.4, 0.05)),
-        needs="position",
+        needs=("position",),
         coordinate="height",
         impossible=above,
         possible=acts,
-        sample={"strength": 0.6, "offset": 0.01},
-        practical={"strength": 0.08},
-        shape=("offset",),
         next_flight="slow passes just below the ceiling.",
     ),
 )

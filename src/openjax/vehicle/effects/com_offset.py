@@ -39,11 +39,19 @@ EFFECT = Effect(
     body=body,
     card=Card(
         fitted=(
-            Fitted("x", mean=0.0, spread=0.002, start=0.0003, step=2e-05),
-            Fitted("y", mean=0.0, spread=0.002, start=0.0003, step=2e-05),
+            Fitted(
+                "x", mean=0.0, spread=0.002, start=0.0003, step=2e-05, sample=0.003, practical=4e-05
+            ),
+            Fitted(
+                "y",
+                mean=0.0,
+                spread=0.002,
+                start=0.0003,
+                step=2e-05,
+                sample=-0.002,
+                practical=4e-05,
+            ),
         ),
-        sample={"x": 0.003, "y": -0.002},
-        practical={"x": 4e-05, "y": 4e-05},
         days=0.0,
         trim=as_rotors,
         next_flight="hover and climbs at several thrusts, with yaw free.",

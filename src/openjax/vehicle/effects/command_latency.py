@@ -34,8 +34,7 @@ EFFECT = Effect(
     initial_memory=initial_memory,
     card=Card(
         path="radio",
-        fitted=(Fitted("delay", mean=0.0, spread=0.02, start=0.01, step=0.0005),),
-        sample={"delay": 0.03},
+        fitted=(Fitted("delay", mean=0.0, spread=0.02, start=0.01, step=0.0005, sample=0.03),),
         next_flight="steps of commanded thrust and rates, with motor commands logged.",
     ),
 )

@@ -61,10 +61,14 @@ EFFECT = Effect(
     wrench=wrench,
     card=Card(
         fitted=(
-            Fitted("force", mean=0.0, spread=0.1, start=0.08, step=0.001),
-            Fitted("length", mean=0.5, spread=0.25, start=0.5, step=0.005),
-            Fitted("width", mean=0.05, spread=0.03, start=0.045, step=0.0005),
-            Fitted("spread", mean=0.1, spread=0.06, start=0.1, step=0.002),
+            Fitted(
+                "force", mean=0.0, spread=0.1, start=0.08, step=0.001, sample=0.05, practical=0.003
+            ),
+            Fitted("length", mean=0.5, spread=0.25, start=0.5, step=0.005, sample=0.5, shape=True),
+            Fitted(
+                "width", mean=0.05, spread=0.03, start=0.045, step=0.0005, sample=0.06, shape=True
+            ),
+            Fitted("spread", mean=0.1, spread=0.06, start=0.1, step=0.002, sample=0.1, shape=True),
         ),
         others=(
             (0.05, 0.8, 0.06, 0.15),
@@ -72,12 +76,9 @@ EFFECT = Effect(
             (0.1, 0.5, 0.02, 0.03),
             (0.05, 0.5, 0.12, 0.1),
         ),
-        needs="position",
+        needs=("position",),
         of_others=True,
         coordinate="height below a neighbour",
-        sample={"force": 0.05, "length": 0.5, "width": 0.06, "spread": 0.1},
-        practical={"force": 0.003},
-        shape=("length", "width", "spread"),
         next_flight="passes of one vehicle 15 to 50 cm above the other.",
     ),
 )

@@ -3,9 +3,9 @@ step of one drone.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import flax.struct
 import jax
@@ -158,9 +158,37 @@ class Parameter:
         return self.domain(load_vehicle() if vehicle is None else vehicle)
 
 
+Situation = Literal["always", "duty_cycles", "samples"]
+"""How motor commands are logged: as duty cycles, as single samples or in any other way."""
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """By how much the vehicle's own number is usually off, in the parameter's unit: free
+    in every hypothesis, never a cause.
+    """
+
+    always: float | Callable[[Vehicle], float] | None = None
+    """A number or a function of the vehicle; None: not at all."""
+    duty_cycles: float | None = None
+    """Where motor commands are duty cycles; None: as always."""
+    samples: float | None = None
+    """Where motor commands are single samples, whose rows hide the rest; None: as
+    always.
+    """
+
+    def size(self, situation: Situation, vehicle: Vehicle) -> float | None:
+        """By how much in a situation, for a vehicle; None: not at all."""
+        special = getattr(self, situation)
+        size = self.always if special is None else special
+        return float(size(vehicle)) if callable(size) else size
+
+
 @dataclass(frozen=True)
 class Fitted:
-    """The fit of one parameter; all numbers are in its unit."""
+    """The fit of one parameter, and what the diagnosis knows of it; all numbers are in
+    its unit.
+    """
 
     name: str
     mean: float
@@ -175,6 +203,26 @@ class Fitted:
     """Standard deviation that the rows of a log leave, whatever a fit says."""
     most: float = float("inf")
     """The end of the search."""
+    sample: float | None = None
+    """A strength within its usual range to fly with, strong enough to see; None: flown
+    as if absent.
+    """
+    practical: float | None = None
+    """How far it must be from doing nothing before anybody would change a simulator for
+    it: one such parameter of an effect is enough. None: it doesn't say how much the
+    effect does.
+    """
+    shape: bool = False
+    """True if it does nothing by itself, as it only says how the others' push is
+    spread. While nothing pushes it can have any value (Davies 1987), so the effect's
+    size is asked with it as it was fitted.
+    """
+    coupling: bool = False
+    """True if by it what turns one axis turns another. Lags, clocks and what motors do
+    unseen stay on their axis, so the replay alone tells it.
+    """
+    nuisance: Nuisance = Nuisance()
+    """By default the vehicle's own number is known."""
 
 
 # In round numbers: nobody has counted how often vehicles have an effect.
@@ -184,6 +232,17 @@ RARE = -5.0
 """One in a hundred and fifty."""
 VERY_RARE = -6.0
 """One in four hundred."""
+
+
+Need = Literal["position", "velocity", "voltage", "force", "thrust_map"]
+"""A channel of a log; a force, of the path or of an accelerometer; or the map from duty
+cycles to thrust, which can imitate effects while it isn't known.
+"""
+Scale = Literal["motion", "torques"]
+"""motion: all accelerations. Of two effects that scale them flights show the product
+alone, so that no set has both. torques: what thrust a motor command makes, and with it
+the gains of all torques, which are then no inertia's.
+"""
 
 
 @dataclass(frozen=True)
@@ -197,37 +256,21 @@ class Card:
     "rate_loop" or "estimator".
     """
     common: float = 0.0
-    """Spread that all its parameters share but those of `coupling`."""
-    coupling: tuple[str, ...] = ()
-    """Parameters by which what turns one axis turns another. Lags, clocks and what
-    motors do unseen stay on their axis, so the replay alone tells these.
-    """
+    """Spread that all its parameters share but those that are a `coupling`."""
     balanced: bool = False
     """True if the mean of its parameters belongs to another effect, and is held near
     zero.
     """
     others: tuple[tuple[float, ...], ...] = ()
     """More starts of the search."""
-    needs: str = ""
-    """The channel without which it can't be told, though it leaves a trace in
-    others.
-    """
-    needs_force: bool = False
-    """True if it can't be told without a force, of the path or of an accelerometer."""
+    needs: tuple[Need, ...] = ()
+    """That without which it can't be told, though it leaves a trace elsewhere."""
     coordinate: str = ""
     """The variable that its force follows, for pictures; none where it makes torques or
     delays.
     """
-    thrust_map: bool = False
-    """True if a map from duty cycles to thrust that isn't known can imitate it."""
-    scales_motion: bool = False
-    """True if it can change all accelerations in proportion: of two such effects
-    flights show the product alone, so that no set has both.
-    """
-    scales_torques: bool = False
-    """True if it changes what thrust a motor command makes, and with it the gains of all
-    torques, which are then no inertia's.
-    """
+    scales: tuple[Scale, ...] = ()
+    """All that it can change in proportion."""
     torque_axes: tuple[int, ...] = ()
     """Axes of the torques by which it is told: what motors do between two rows can
     imitate them.
@@ -238,14 +281,6 @@ class Card:
     """possible({parameter: value}, {parameter: deviation}): whether fitted values lie
     within physical bounds.
     """
-    nuisance: Mapping[str, float | Callable[[Vehicle], float]] = field(default_factory=dict)
-    """{parameter: by how much the vehicle's number is usually off}, as a number or a
-    function of the vehicle: free in every hypothesis, never a cause.
-    """
-    nuisance_duty: Mapping[str, float] = field(default_factory=dict)
-    """The same where motor commands are duty cycles."""
-    nuisance_samples: Mapping[str, float] = field(default_factory=dict)
-    """The same where motor commands are single samples, whose rows hide the rest."""
     takes_over: tuple[str, Callable[[Mapping[str, float]], Mapping[str, float]]] | None = None
     """Another effect that a vehicle may always have and that is part of this one, and how that
     one's values {parameter: value} are said by this one's parameters.
@@ -260,21 +295,10 @@ class Card:
     """
     impossible: Callable[[Any], bool] | None = None
     """impossible(position): whether a flight along position (T, 3) m rules it out."""
-    sample: Mapping[str, float] = field(default_factory=dict)
-    """A strength within its usual range to fly with, strong enough to see."""
-    practical: Mapping[str, float] = field(default_factory=dict)
-    """{parameter: how far it must be from doing nothing before anybody would change a
-    simulator for it}; one of them is enough.
-    """
     departure: Callable[[], Any] | None = None
     """departure() -> (n, p): what a unit of each parameter does in n usual states, such
     that its root sum of squares is 1 where it begins to matter. In place of `practical`
-    where no parameter by itself says how much the effect does.
-    """
-    shape: tuple[str, ...] = ()
-    """Parameters that do nothing by themselves, as they only say how the others' push
-    is spread. While nothing pushes they can have any value (Davies 1987), so the
-    effect's size is asked with each as it was fitted.
+    numbers where no parameter by itself says how much the effect does.
     """
     days: float | None = None
     """Of an effect that every vehicle has to some degree: the standard deviation of its
@@ -286,6 +310,11 @@ class Card:
     """
     next_flight: str = ""
     """The flight that would show it, in words."""
+
+    @property
+    def sample(self) -> dict[str, float]:
+        """{parameter: value} to fly with; the others as if absent."""
+        return {p.name: p.sample for p in self.fitted if p.sample is not None}
 
 
 # Hooks of one drone; `parameters` is {name: () array}, `memory` a pytree of arrays.

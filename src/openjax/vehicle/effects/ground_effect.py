@@ -53,16 +53,17 @@ EFFECT = Effect(
     thrust=thrust,
     card=Card(
         fitted=(
-            Fitted("strength", mean=0.0, spread=0.8, start=0.4, step=0.01),
-            Fitted("offset", mean=0.012, spread=0.01, start=0.012, step=0.0005),
+            Fitted(
+                "strength", mean=0.0, spread=0.8, start=0.4, step=0.01, sample=0.8, practical=0.08
+            ),
+            Fitted(
+                "offset", mean=0.012, spread=0.01, start=0.012, step=0.0005, sample=0.01, shape=True
+            ),
         ),
         others=((0.4, 0.0), (0.4, 0.025), (0.4, 0.05)),
-        needs="position",
+        needs=("position",),
         coordinate="height",
         possible=acts,
-        sample={"strength": 0.8, "offset": 0.01},
-        practical={"strength": 0.08},
-        shape=("offset",),
         next_flight="slow passes between 3 and 20 cm above the floor.",
     ),
 )

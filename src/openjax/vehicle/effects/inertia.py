@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import RATIO, Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import RATIO, Card, Effect, Fitted, Nuisance, Parameter
 
 AXES = ("xx", "yy", "zz")
 
@@ -68,19 +68,33 @@ EFFECT = Effect(
     wrench=wrench,
     card=Card(
         torque_axes=(0, 1),
-        thrust_map=True,
+        needs=("thrust_map",),
         possible=heavy_inside,
         fitted=(
-            *(Fitted(k, mean=1.0, spread=0.12, start=1.1, step=0.005) for k in AXES),
-            Fitted("xy", mean=0.0, spread=0.05, start=0.0, step=0.002),
+            *(
+                Fitted(
+                    axis,
+                    mean=1.0,
+                    spread=0.12,
+                    start=1.1,
+                    step=0.005,
+                    sample=1.4,
+                    practical=0.05,
+                    nuisance=Nuisance(off, duty_cycles=0.2, samples=0.3),
+                )
+                for axis, off in zip(AXES, (0.04, 0.04, 0.015), strict=True)
+            ),
+            Fitted(
+                "xy",
+                mean=0.0,
+                spread=0.05,
+                start=0.0,
+                step=0.002,
+                practical=0.03,
+                coupling=True,
+            ),
         ),
         common=0.3,
-        coupling=("xy",),
-        nuisance={"xx": 0.04, "yy": 0.04, "zz": 0.015},
-        nuisance_duty=dict.fromkeys(AXES, 0.2),
-        nuisance_samples=dict.fromkeys(AXES, 0.3),
-        sample=dict.fromkeys(AXES, 1.4),
-        practical=dict.fromkeys(AXES, 0.05) | {"xy": 0.03},
         days=0.0,
         next_flight="roll, pitch and yaw doublets with the motor commands logged.",
     ),

@@ -33,14 +33,21 @@ EFFECT = Effect(
     },
     body=body,
     card=Card(
-        needs_force=True,
+        needs=("force", "thrust_map"),
         coordinate="thrust",
-        fitted=(Fitted("extra", mean=0.0, spread=0.005, start=0.001, step=2e-05),),
-        thrust_map=True,
-        scales_motion=True,
+        fitted=(
+            Fitted(
+                "extra",
+                mean=0.0,
+                spread=0.005,
+                start=0.001,
+                step=2e-05,
+                sample=0.003,
+                practical=0.0003,
+            ),
+        ),
+        scales=("motion",),
         weighed=True,
-        sample={"extra": 0.003},
-        practical={"extra": 0.0003},
         trim=lambda values, vehicle: np.full(4, -values["extra"] / float(vehicle.mass)),
         next_flight=(
             "weigh the vehicle, then hover and climb hard: a weighed mass leaves only the thrust."

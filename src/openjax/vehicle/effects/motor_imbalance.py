@@ -38,16 +38,19 @@ EFFECT = Effect(
     },
     thrust=thrust,
     card=Card(
-        fitted=(
-            Fitted("m1", mean=0.0, spread=0.05, start=0.02, step=0.001),
-            Fitted("m2", mean=0.0, spread=0.05, start=-0.01, step=0.001),
-            Fitted("m3", mean=0.0, spread=0.05, start=0.0, step=0.001),
-            Fitted("m4", mean=0.0, spread=0.05, start=-0.01, step=0.001),
+        fitted=tuple(
+            Fitted(
+                name, mean=0.0, spread=0.05, start=start, step=0.001, sample=sample, practical=0.002
+            )
+            for name, start, sample in (
+                ("m1", 0.02, 0.06),
+                ("m2", -0.01, -0.04),
+                ("m3", 0.0, 0.02),
+                ("m4", -0.01, -0.05),
+            )
         ),
         balanced=True,
         possible=flies,
-        sample={"m1": 0.06, "m2": -0.04, "m3": 0.02, "m4": -0.05},
-        practical={"m1": 0.002, "m2": 0.002, "m3": 0.002, "m4": 0.002},
         days=0.03,
         trim=lambda values, vehicle: np.array([values[m] for m in ("m1", "m2", "m3", "m4")]),
         next_flight="hover and climbs at several thrusts, with yaw free.",

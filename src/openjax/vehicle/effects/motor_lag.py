@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Nuisance, Parameter
 
 _SHORTEST = 1e-3  # s
 # small brushed motors were measured at up to 0.1 s in all, and no loop flies through
@@ -77,16 +77,31 @@ EFFECT = Effect(
     body=body,
     card=Card(
         fitted=(
-            Fitted("extra_up", mean=0.0, spread=0.03, start=0.01, step=0.0005, error=0.001),
-            Fitted("extra_down", mean=0.0, spread=0.03, start=0.01, step=0.0005, error=0.001),
+            Fitted(
+                "extra_up",
+                mean=0.0,
+                spread=0.03,
+                start=0.01,
+                step=0.0005,
+                error=0.001,
+                sample=0.02,
+                practical=0.0025,
+                nuisance=Nuisance(spin_up_error, duty_cycles=0.01, samples=0.01),
+            ),
+            Fitted(
+                "extra_down",
+                mean=0.0,
+                spread=0.03,
+                start=0.01,
+                step=0.0005,
+                error=0.001,
+                sample=0.03,
+                practical=0.004,
+                nuisance=Nuisance(spin_down_error, duty_cycles=0.01, samples=0.01),
+            ),
         ),
         common=0.03,
         possible=lags,
-        nuisance={"extra_up": spin_up_error, "extra_down": spin_down_error},
-        nuisance_duty={"extra_up": 0.01, "extra_down": 0.01},
-        nuisance_samples={"extra_up": 0.01, "extra_down": 0.01},
-        sample={"extra_up": 0.02, "extra_down": 0.03},
-        practical={"extra_up": 0.0025, "extra_down": 0.004},
         days=0.0,
         next_flight="roll, pitch and thrust doublets, as short as the vehicle allows.",
     ),

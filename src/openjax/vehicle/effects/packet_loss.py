@@ -46,8 +46,7 @@ EFFECT = Effect(
     random=True,
     card=Card(
         path="radio",
-        fitted=(Fitted("probability", mean=0.0, spread=0.15, start=0.05, step=0.01),),
-        sample={"probability": 0.2},
+        fitted=(Fitted("probability", mean=0.0, spread=0.15, start=0.05, step=0.01, sample=0.2),),
         next_flight="steps of commanded thrust and rates, with motor commands logged.",
     ),
 )

@@ -26,8 +26,9 @@ EFFECT = Effect(
     body=body,
     card=Card(
         path="rate_loop",
-        fitted=tuple(Fitted(gain, mean=1.0, spread=0.4, start=1.0, step=0.05) for gain in GAINS),
-        sample=dict.fromkeys(GAINS, 0.65),
+        fitted=tuple(
+            Fitted(gain, mean=1.0, spread=0.4, start=1.0, step=0.05, sample=0.65) for gain in GAINS
+        ),
         next_flight="roll, pitch and yaw doublets with commands and motor commands logged.",
     ),
 )

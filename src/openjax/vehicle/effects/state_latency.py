@@ -53,8 +53,7 @@ EFFECT = Effect(
     initial_memory=initial_memory,
     card=Card(
         path="estimator",
-        fitted=(Fitted("delay", mean=0.0, spread=0.02, start=0.0, step=0.0005),),
-        sample={"delay": 0.03},
+        fitted=(Fitted("delay", mean=0.0, spread=0.02, start=0.0, step=0.0005, sample=0.03),),
         next_flight="fast roll and pitch manoeuvres with pose and gyroscope logged.",
     ),
 )

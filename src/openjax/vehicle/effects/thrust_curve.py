@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from openjax.vehicle.effects.effect import RARE, Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import RARE, Card, Effect, Fitted, Nuisance, Parameter
 
 
 def motor(parameters, motor_command, context):
@@ -59,17 +59,30 @@ EFFECT = Effect(
     card=Card(
         coordinate="thrust",
         fitted=(
-            Fitted("offset", mean=0.0, spread=0.08, start=0.02, step=0.001),
+            Fitted(
+                "offset",
+                mean=0.0,
+                spread=0.08,
+                start=0.02,
+                step=0.001,
+                nuisance=Nuisance(duty_cycles=0.15),
+            ),
             Fitted("slope", mean=1.0, spread=0.2, start=0.95, step=0.001),
-            Fitted("curvature", mean=0.0, spread=0.25, start=0.02, step=0.001, error=0.1),
+            Fitted(
+                "curvature",
+                mean=0.0,
+                spread=0.25,
+                start=0.02,
+                step=0.001,
+                error=0.1,
+                sample=0.25,
+                nuisance=Nuisance(duty_cycles=0.3),
+            ),
         ),
-        thrust_map=True,
-        scales_torques=True,
-        scales_motion=True,
+        needs=("thrust_map",),
+        scales=("motion", "torques"),
         log_odds=RARE,
         possible=rises,
-        nuisance_duty={"offset": 0.15, "curvature": 0.3},
-        sample={"curvature": 0.25},
         departure=bend,
         days=0.0,
         next_flight="steps of collective thrust between 40 and 90 %.",

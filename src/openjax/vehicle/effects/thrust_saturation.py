@@ -57,7 +57,7 @@ EFFECT = Effect(
     card=Card(
         coordinate="thrust",
         fitted=(
-            Fitted("limit", mean=0.8, spread=0.12, start=0.8, step=0.002),
+            Fitted("limit", mean=0.8, spread=0.12, start=0.8, step=0.002, sample=0.82),
             Fitted("voltage_slope", mean=0.0, spread=0.1, start=0.0, step=0.01),
         ),
         # a limit that no command reaches has no slope, so the search starts from many
@@ -70,11 +70,10 @@ EFFECT = Effect(
             (0.76, 0.0),
             (0.7, 0.0),
         ),
-        thrust_map=True,
-        scales_torques=True,
+        needs=("thrust_map",),
+        scales=("torques",),
         possible=tops_out,
         at_voltage=frozen,
-        sample={"limit": 0.82},
         next_flight="short full-thrust climbs.",
     ),
 )

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from openjax.vehicle.effects.effect import RATIO, Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import RATIO, Card, Effect, Fitted, Nuisance, Parameter
 
 
 def body(parameters, vehicle):
@@ -29,16 +29,21 @@ EFFECT = Effect(
     },
     body=body,
     card=Card(
-        needs_force=True,
+        needs=("force", "thrust_map"),
         coordinate="thrust",
-        fitted=(Fitted("scale", mean=0.0, spread=0.1, start=0.02, step=0.001),),
-        nuisance={"scale": 0.004},
-        nuisance_duty={"scale": 0.3},
-        thrust_map=True,
-        scales_torques=True,
-        scales_motion=True,
-        sample={"scale": -0.08},
-        practical={"scale": 0.01},
+        fitted=(
+            Fitted(
+                "scale",
+                mean=0.0,
+                spread=0.1,
+                start=0.02,
+                step=0.001,
+                sample=-0.08,
+                practical=0.01,
+                nuisance=Nuisance(0.004, duty_cycles=0.3),
+            ),
+        ),
+        scales=("motion", "torques"),
         days=0.012,
         trim=lambda values, vehicle: np.full(4, values["scale"]),
         next_flight=(

@@ -67,20 +67,18 @@ EFFECT = Effect(
     wrench=wrench,
     card=Card(
         fitted=(
-            Fitted("x", mean=0.0, spread=1.5, start=0.3, step=0.01),
-            Fitted("y", mean=0.0, spread=1.5, start=0.3, step=0.01),
+            Fitted("x", mean=0.0, spread=1.5, start=0.3, step=0.01, sample=1.2, practical=0.1),
+            Fitted("y", mean=0.0, spread=1.5, start=0.3, step=0.01, sample=-0.8, practical=0.1),
+            # no practical number: air that moves along z pushes as a wrong thrust does
             Fitted("z", mean=0.0, spread=0.5, start=0.0, step=0.01),
-            Fitted("drag", mean=0.013, spread=0.006, start=0.013, step=0.0001),
+            Fitted("drag", mean=0.013, spread=0.006, start=0.013, step=0.0001, sample=0.015),
             Fitted("along", mean=0.8, spread=0.4, start=1.0, step=0.01),
         ),
-        needs="velocity",
+        needs=("velocity",),
         coordinate="body velocity",
         log_odds=VERY_RARE,
         possible=drags,
         takes_over=("rotor_drag", by_its_drag),
-        sample={"x": 1.2, "y": -0.8, "drag": 0.015},
-        # air that moves along z pushes as a wrong thrust does
-        practical={"x": 0.1, "y": 0.1},
         next_flight="hover, turning slowly through a full circle of yaw.",
     ),
 )

@@ -1,6 +1,6 @@
 """The rotors' reaction torque differs from what is assumed, their thrust doesn't."""
 
-from openjax.vehicle.effects.effect import RATIO, Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import RATIO, Card, Effect, Fitted, Nuisance, Parameter
 
 
 def body(parameters, vehicle):
@@ -27,12 +27,18 @@ EFFECT = Effect(
     body=body,
     card=Card(
         torque_axes=(2,),
-        nuisance={"ratio": 0.01},
-        nuisance_duty={"ratio": 0.5},
-        nuisance_samples={"ratio": 0.2},
-        fitted=(Fitted("ratio", mean=1.0, spread=0.5, start=0.9, step=0.005),),
-        sample={"ratio": 0.4},
-        practical={"ratio": 0.05},
+        fitted=(
+            Fitted(
+                "ratio",
+                mean=1.0,
+                spread=0.5,
+                start=0.9,
+                step=0.005,
+                sample=0.4,
+                practical=0.05,
+                nuisance=Nuisance(0.01, duty_cycles=0.5, samples=0.2),
+            ),
+        ),
         days=0.0,
         next_flight="yaw doublets and steps.",
     ),
