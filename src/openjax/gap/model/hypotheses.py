@@ -148,7 +148,9 @@ def _descend(fit: SetFit, iterations: int) -> SetFit:
         theta = fit.theta.copy()
         theta[index] += share * np.clip(step, -reach, reach)
         theta[index] = np.minimum(theta[index], most)
-        ahead = _at(fit.replay, fit.effects, theta)
+        # where a parameter means nothing any more there is no number, which is no gain
+        with np.errstate(invalid="ignore"):
+            ahead = _at(fit.replay, fit.effects, theta)
         gain = fit.objective - ahead.objective
         if gain > 0.0:
             fit = ahead
