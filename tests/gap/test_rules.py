@@ -129,8 +129,8 @@ def test_what_takes_a_part_of_one_channel_alone_is_named():
     told = shares_of(
         list(shares), {"wind": ("velocity x", 0.9), "motor_imbalance": ("rates x", 1.0)}
     )
-    assert told.in_words("wind", "wind") == "wind 0.02 [0.01, 0.02], 0.90 of velocity x"
-    assert told.in_words("motor_imbalance", "rotors") == "rotors 0.98 [0.97, 0.99]"
+    assert told.of_one_channel("wind") == "0.90 of velocity x"
+    assert told.of_one_channel("motor_imbalance") == ""
 
 
 def test_nobody_who_logged_one_vehicle_is_sent_for_a_second():

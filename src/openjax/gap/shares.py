@@ -107,15 +107,11 @@ class Split:
         _, of_a_channel = self.of_a_channel.get(effect, ("", 0.0))
         return max(self.effects[effect].interval90[1], of_a_channel)
 
-    def in_words(self, effect: str, name: str) -> str:
-        """An effect's share with its interval, and where that is small the channel for which it
-        is named.
-        """
-        share = self.effects[effect]
-        low, high = share.interval90
-        text = f"{name} {share.value:.2f} [{low:.2f}, {high:.2f}]"
+    def of_one_channel(self, effect: str) -> str:
+        """The part of a channel for which an effect is named whose share is small."""
         channel, part = self.of_a_channel.get(effect, ("", 0.0))
-        return f"{text}, {part:.2f} of {channel}" if high < DECISION.form_error < part else text
+        is_small = self.effects[effect].interval90[1] < DECISION.form_error < part
+        return f"{part:.2f} of {channel}" if is_small else ""
 
 
 def split(

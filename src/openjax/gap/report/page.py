@@ -71,10 +71,11 @@ def shares(report: Report) -> list[dict]:
     if not report.effects and not report.sensors:
         return []
 
-    def row(name, share, kind):
+    def row(name, share, kind, note=""):
         low, high = share.interval90
         return {
             "name": name.replace("_", " "),
+            "note": note,
             "kind": kind,
             "value": per_cent(share.value),
             "low": per_cent(low),
@@ -85,7 +86,10 @@ def shares(report: Report) -> list[dict]:
         """Within the chart: an estimate's interval may leave it."""
         return min(max(100.0 * value, 0.0), 100.0)
 
-    rows = [row(effect, share, "effect") for effect, share in report.shares.effects.items()]
+    rows = [
+        row(effect, share, "effect", report.shares.of_one_channel(effect))
+        for effect, share in report.shares.effects.items()
+    ]
     rows.append(row("sensors and clocks", report.shares.sensors, "nuisance"))
     rows.append(row("unexplained", report.shares.unexplained, "unexplained"))
     return rows

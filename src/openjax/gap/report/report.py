@@ -304,7 +304,12 @@ class Report:
         """Every named class' share with its interval, then sensors and clocks, then
         what is unexplained.
         """
-        rows = [self.shares.in_words(e, self.class_of(e)) for e in self.named]
+        rows = []
+        for effect in self.named:
+            share = self.shares.effects[effect]
+            low, high = share.interval90
+            row = f"{self.class_of(effect)} {share.value:.2f} [{low:.2f}, {high:.2f}]"
+            rows.append(", ".join(filter(None, (row, self.shares.of_one_channel(effect)))))
         rows.append(f"sensors and clocks {self.shares.sensors.value:.2f}")
         rows.append(f"unexplained {self.shares.unexplained.value:.2f}")
         return f"Shares of the gap: {'; '.join(rows)}."
