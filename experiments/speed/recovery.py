@@ -40,8 +40,13 @@ def tumble(key):
     return drone.replace(body_rates=2.0 * jax.random.normal(rates, (3,)))
 
 
+def axes_of(drone):
+    """(3, 3) the body's axes in the world's, one a row."""
+    return jax.vmap(lambda axis: rotate(drone.quaternion, axis))(jnp.eye(3))
+
+
 def see(drone):
-    axes = jax.vmap(lambda axis: rotate(drone.quaternion, axis))(jnp.eye(3))
+    axes = axes_of(drone)
     return jnp.concatenate([drone.position, axes.ravel(), drone.velocity, drone.body_rates / 10.0])
 
 
@@ -61,7 +66,7 @@ def by_hand(drone, gains=(16.0, 9.0, 12.0)):
     """The action of a controller: gains of position, velocity and tilt, the best of some."""
     wanted = -gains[0] * drone.position - gains[1] * drone.velocity
     wanted += jnp.array([0.0, 0.0, VEHICLE.gravity])
-    axes = jax.vmap(lambda axis: rotate(drone.quaternion, axis))(jnp.eye(3))
+    axes = axes_of(drone)
     turn = jnp.cross(axes[2], wanted)
     angle = jnp.arctan2(jnp.linalg.norm(turn), axes[2] @ wanted)
     rates = gains[2] * angle * (axes @ turn) / (jnp.linalg.norm(turn) + 1e-6)

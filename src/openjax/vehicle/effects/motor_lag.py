@@ -76,29 +76,22 @@ EFFECT = Effect(
     },
     body=body,
     card=Card(
-        fitted=(
+        fitted=tuple(
             Fitted(
-                "extra_up",
+                name,
                 mean=0.0,
                 spread=0.03,
                 start=0.01,
                 step=0.0005,
                 error=0.001,
-                sample=0.02,
-                practical=0.0025,
-                nuisance=Nuisance(spin_up_error, duty_cycles=0.01, samples=0.01),
-            ),
-            Fitted(
-                "extra_down",
-                mean=0.0,
-                spread=0.03,
-                start=0.01,
-                step=0.0005,
-                error=0.001,
-                sample=0.03,
-                practical=0.004,
-                nuisance=Nuisance(spin_down_error, duty_cycles=0.01, samples=0.01),
-            ),
+                sample=sample,
+                practical=practical,
+                nuisance=Nuisance(off, duty_cycles=0.01, samples=0.01),
+            )
+            for name, sample, practical, off in (
+                ("extra_up", 0.02, 0.0025, spin_up_error),
+                ("extra_down", 0.03, 0.004, spin_down_error),
+            )
         ),
         common=0.03,
         possible=lags,
