@@ -200,6 +200,15 @@ def test_motors_that_were_averaged_before_their_row_are_found_and_name_nothing(t
     assert report.effects == () and "one row earlier" in report.sensors[0]
 
 
+def test_motors_quicker_than_told_are_named_with_their_size(tmp_path):
+    """The replay of the motion has bounds for a lag; what the torques told isn't held to them."""
+    quick = {"motor_lag": {"extra_up": -0.015, "extra_down": -0.015}}
+    report = diagnose_case(load_case(_case(tmp_path / "quick", quick)))
+    assert report.effects == ("motor_lag",)
+    for number in report.parameters["motor_lag"].values():
+        assert number.value == pytest.approx(-0.015, abs=0.002)
+
+
 def test_nothing_is_named_where_nothing_is_wrong(reports):
     report = reports["none"]
     assert report.effects == () and report.verdict == "none"
