@@ -3,8 +3,6 @@ whether the difference matters, and whether an effect can be, and is of a size t
 counts.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Float
 from scipy.stats import chi2
@@ -21,10 +19,6 @@ from openjax.gap.shapes import Squares
 # standard errors, as the gain of a true effect is half the square of what it does, and
 # its standard error that square's root.
 DETECTABLE = 2.0 * DECISION.standard_errors**2
-# Growth of the gap that counts where nuisances are as the best set has them. With .05,
-# errors of the rate loop's form are named as inertia; with .15 or .2 as much is right
-# on the cases tried.
-DOES = 0.15
 
 
 def difference(better: Validation, other: Validation) -> tuple[float, float, float]:
@@ -43,46 +37,15 @@ def difference(better: Validation, other: Validation) -> tuple[float, float, flo
     return (float((cross + 0.5 * energy).sum()), square**0.5, float(energy.sum()) / square)
 
 
-def growth(
-    squares: Squares, floor: Float[np.ndarray, " channels"]
-) -> Float[np.ndarray, "*sets"] | np.floating:
-    """By how many floors a gap of squared errors (..., channels) is larger than one of
-    the squares `floor` (channels,).
+def worse(gain, error, squares: Squares, best: Float[np.ndarray, " channels"]):
+    """(...) whether sets are clearly worse than the best one: by so many nats `gain` with their
+    standard `error`, and by a gap, of `squares` (..., channels), that is larger by what matters
+    of what the best one leaves: not of what no effect does, since one that is large would hide
+    all others.
     """
-    return np.sqrt((squares / floor).mean(-1)) - 1.0
-
-
-class Gaps(NamedTuple):
-    """Squared errors that are left."""
-
-    squares: Squares
-    """(..., channels) by the sets in question."""
-    best: Float[np.ndarray, " channels"]
-    """By the best set."""
-    nothing: Float[np.ndarray, " channels"]
-    """By no effect."""
-
-
-def matters(gaps: Gaps, least: float = DECISION.least_gap):
-    """(...) whether the gap of a set is so much larger than that of the best one that
-    it matters beside what no effect leaves.
-    """
-    return growth(gaps.squares, gaps.best) > np.maximum(
-        least, DECISION.form_error * growth(gaps.nothing, gaps.best)
-    )
-
-
-def worse(gain, error, gaps: Gaps, beside: Gaps):
-    """True if a set is clearly worse than the best: by so many nats `gain` with their
-    standard `error`, and so that it matters.
-
-    Nuisances take a part of what an effect does, as a wrong moment of inertia looks
-    like a nuisance of some per cent. Whether an effect matters is also asked of
-    `beside`, the same gaps with nuisances as the best set has them; whether it is
-    needed, of the nats alone, in which nuisances are free.
-    """
-    clear = (gain > DECISION.standard_errors * error) & matters(gaps)
-    return clear | ((gain > REACH * error) & matters(beside, DOES))
+    growth = np.sqrt((squares / best).mean(-1)) - 1.0
+    matters = growth > DECISION.least_gap
+    return (gain > DECISION.standard_errors * error) & matters
 
 
 def log_odds(effects) -> float:

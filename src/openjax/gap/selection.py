@@ -23,10 +23,8 @@ from jaxtyping import Float
 from openjax.background import side_by_side
 from openjax.gap.criteria import (
     DETECTABLE,
-    Gaps,
     beyond_bounds,
     difference,
-    growth,
     log_odds,
     possible,
     practical,
@@ -46,10 +44,6 @@ from openjax.gap.model.table import Model, Table, build, with_effects
 from openjax.gap.posterior import LARGEST
 
 NOTHING = frozenset()
-# What turns a vehicle all the time, which motors hold against.
-TRIMS = frozenset(
-    e for e, card in CARDS.items() if card.trim is not None and "motion" not in card.scales
-)
 # Sets that are fitted in full, of those that the model promises as linearised around
 # nothing, and then around the best of these.
 FITTED = 10
@@ -82,14 +76,13 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """A `hypothesis` and the `table` around it; `effects` that it names, strongest
-    first; `weights` {effects: share of the draws in which that set is chosen};
-    `equivalent` {effect: others that would do as well in its place}.
+    """A `hypothesis` and the `table` around it; `weights` {effects: share of the draws in
+    which that set is chosen}; `equivalent` {effect: others that would do as well in its
+    place}.
     """
 
     hypothesis: Hypothesis
     table: Table
-    effects: tuple[str, ...]
     weights: dict[frozenset, float]
     equivalent: dict[str, list[str]]
     search: Search
@@ -97,6 +90,11 @@ class Selection:
     @property
     def fit(self) -> SetFit:
         return self.hypothesis.fit
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Of the set, before they are found to be worth a name."""
+        return self.fit.effects
 
     def probability(self, effect: str) -> float:
         """That the effect, or one that would do as well in its place, acts."""
@@ -110,16 +108,8 @@ def select(evidence: Evidence) -> Selection:
     """Choose among the physics effects that the flights can show."""
     search = search_sets(evidence)
     weights, best, fit = settle(search)
-    without = {e: search.of_set(set(best.effects) - {e}, best.fit) for e in best.effects}
-    gains = {
-        e: growth(h.validation.squares.sum(0), best.validation.squares.sum(0))
-        for e, h in without.items()
-    }
-    # strongest is what is missed most, not what is largest: sizes have other units
-    ranking = tuple(sorted(gains, key=lambda e: -gains[e]))
     best = replace(best, fit=fit)
-    table = build(best.fit, {})
-    return Selection(best, table, ranking, weights, search.equivalents(best, ranking), search)
+    return Selection(best, build(fit, {}), weights, search.equivalents(best), search)
 
 
 def settle(search: Search) -> tuple[dict[frozenset, float], Hypothesis, SetFit]:
@@ -144,7 +134,6 @@ def search_sets(evidence: Evidence) -> Search:
     search.enumerate(search.base, FITTED)
     search.enumerate(search.best, FITTED_AGAIN, search.beyond_bounds())
     search.fit_without_dropouts()
-    search.fit_trims_alone()
     return search
 
 
@@ -280,19 +269,6 @@ class Search:
                     break
                 hypothesis = self.of_set(left, hypothesis.fit)
 
-    def fit_trims_alone(self) -> None:
-        """Fit what the best sets hold of a vehicle's trims, and nothing else of them."""
-        best = sorted(self.candidates, key=lambda h: -h.score)[:FITTED_AGAIN]
-        for hypothesis in best:
-            self.trims_of(hypothesis)
-
-    def trims_of(self, hypothesis: Hypothesis) -> Hypothesis:
-        """The part of a hypothesis that is a vehicle's trims and of what others named: with
-        these alone a real vehicle is as a simulated one is without.
-        """
-        trims = {e for e in hypothesis.effects if e in TRIMS}
-        return self.of_set(self.torque_effects | trims, hypothesis.fit)
-
     def _gust_nats(self, key: frozenset) -> float:
         """Nats by which gusts speak for a set with each effect as it was alone."""
         theta = self.base.fit.theta.copy()
@@ -326,22 +302,13 @@ class Search:
         """True if flights tell a hypothesis from the best one, and it leaves a gap so
         much larger that it matters.
         """
-        gain, error, _ = difference(best.validation, other.validation)
         if best.support - other.support > DETECTABLE:
             return True
+        gain, error, _ = difference(best.validation, other.validation)
+        squares = other.validation.squares.sum(0)
+        return bool(worse(gain, error, squares, best.validation.squares.sum(0)))
 
-        def gaps_by(squares_of) -> Gaps:
-            return Gaps(
-                squares_of(other.validation).sum(0),
-                squares_of(best.validation).sum(0),
-                squares_of(self.trims_of(best).validation).sum(0),
-            )
-
-        gaps = gaps_by(lambda validation: validation.squares)
-        beside = gaps_by(lambda v: v.squares_beside(best.validation))
-        return bool(worse(gain, error, gaps, beside))
-
-    def equivalents(self, hypothesis: Hypothesis, effects) -> dict[str, list[str]]:
+    def equivalents(self, hypothesis: Hypothesis) -> dict[str, list[str]]:
         """For each named effect those in whose place, of the sets visited, flights
         don't tell the difference: not a wind that doesn't blow, which is a drag.
         """
@@ -351,7 +318,7 @@ class Search:
 
         torques = self.evidence.torques
         out = {} if torques is None else dict(torques.equivalent)
-        for effect in set(effects) - self.torque_effects:
+        for effect in set(hypothesis.effects) - self.torque_effects:
             rest = frozenset(hypothesis.effects) - {effect}
             alike = [
                 next(iter(key - rest))
@@ -376,27 +343,11 @@ class Search:
         gusts = np.array([h.support for h in sets])
         # (D, sets)
         density = weights @ np.array([h.validation.nats for h in sets]).T + gusts
-        trims = [self.trims_of(h).validation for h in sets]
+        squares = np.einsum("db,sbc->dsc", weights, np.array([h.validation.squares for h in sets]))
         choices = []
-        squares = np.array([h.validation.squares for h in sets])
-        beside = {}  # of a best set: the squares of all sets, nuisances as it has them
-        for weight, nats in zip(weights, density, strict=True):
+        for nats, gaps in zip(density, squares, strict=True):
             best = int(np.argmax(nats + odds))
-            if best not in beside:
-                beside[best] = np.array(
-                    [h.validation.squares_beside(sets[best].validation) for h in sets]
-                )
-            sums = np.einsum("b,sbc->sc", weight, squares)
-            sums_beside = np.einsum("b,sbc->sc", weight, beside[best])
-            trim = trims[best]
-            sums_of_trims = weight @ trim.squares
-            trims_beside = weight @ trim.squares_beside(sets[best].validation)
-            out = worse(
-                nats[best] - nats,
-                errors[best],
-                Gaps(sums, sums[best], sums_of_trims),
-                Gaps(sums_beside, sums_beside[best], trims_beside),
-            )
+            out = worse(nats[best] - nats, errors[best], gaps, gaps[best])
             # gusts judge by themselves: they count no blocks
             out |= gusts[best] - gusts > DETECTABLE
             usual = ~out & (odds == odds[~out].max())

@@ -31,22 +31,6 @@ class Validation:
     """(M,) whitened residuals and own nuisances, block after block."""
     starts: np.ndarray
     """(B,) where each block begins in it."""
-    error: np.ndarray
-    """(B, K, C, C) quadratic forms of the coefficients, which the squared errors
-    are.
-    """
-    coefficients: np.ndarray
-    """(B, C) coefficients."""
-    nuisances: np.ndarray
-    """(N,) places in them of the nuisances: the last."""
-
-    def squares_beside(self, other: Validation) -> np.ndarray:
-        """`squares` with the nuisances as another model has them: what nuisances take
-        on themselves in its place is an error as well, if that model is right.
-        """
-        coefficients = self.coefficients.copy()
-        coefficients[:, self.nuisances] = other.coefficients[:, other.nuisances]
-        return _squares(self.error, coefficients)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,10 +110,6 @@ def cross_validate(table: Table, model: Model) -> Validation:
         nuisance_sizes=-coefficients[:, table.nuisances[table.is_shared]],
         residuals=np.concatenate(residuals),
         starts=np.cumsum([0, *map(len, residuals)])[:-1],
-        # half the memory: one of each set that is visited
-        error=table.error.astype(np.float32),
-        coefficients=coefficients,
-        nuisances=table.nuisances,
     )
 
 
