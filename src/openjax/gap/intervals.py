@@ -92,18 +92,6 @@ def _estimate(estimate: Estimated, parameter: Parameter, vehicle) -> Estimate:
     )
 
 
-def interval(estimate: Estimated, parameter) -> tuple[float, float]:
-    """The 90 % interval. A number that multiplies something (it does nothing at 1)
-    stays positive: its logarithm is normal.
-    """
-    value = estimate.value
-    below = REACH * estimate.below
-    above = REACH * estimate.above
-    if parameter.none == 1.0 and value > 0.0:
-        return value * float(np.exp(-below / value)), value * float(np.exp(above / value))
-    return value - below, value + above
-
-
 def _of_physics(fit: SetFit, effect: str, parameter, of_torques: Mapping) -> Estimated:
     """A parameter of the fit, or of the torques as they were measured. Forms may be
     wrong by a share of the effect's largest parameter of that unit.
