@@ -206,8 +206,6 @@ class Search:
         rest = key - self.torque_effects
         if key == self.torque_effects:
             return self.evidence.motion.base
-        if self.torque_effects < key and len(rest) == 1:
-            return self.singles[next(iter(rest))]
         start = near.theta.copy()
         for new in rest - set(near.effects):  # as it was alone
             start[places((new,))] = self.singles[new].theta[places((new,))]
@@ -235,22 +233,30 @@ class Search:
         """
         table = build(near.fit, self.singles)
         models = {key: self._model(table, key) for key in self.sets() if not key & without}
+        base = self.torque_effects
 
-        def rank(keys, promise_of):
-            score = {
+        def promised(keys, promise_of) -> dict[frozenset, float]:
+            return {
                 k: promise_of(table, models[k])
                 - len(models[k].free)
                 + log_odds(k)
                 + self._gust_nats(k)
                 for k in keys
             }
-            base = score[self.torque_effects]
-            return [k for k in sorted(keys, key=lambda k: -score[k]) if score[k] > base]
 
-        candidates = rank(models, promise_unbounded)[: SCREENED * most]
-        best = rank(
-            [self.torque_effects, *(k for k in candidates if k != self.torque_effects)], promise
-        )
+        def rank(score: dict[frozenset, float]) -> list[frozenset]:
+            """Those that promise more than nothing and than any part of them, the best first:
+            an effect that adds nothing to the others is in no set that is chosen.
+            """
+
+            def gains(key):
+                parts = [key - {e} for e in key - base]
+                return all(score[key] > score.get(part, -np.inf) for part in (base, *parts))
+
+            return [k for k in sorted(score, key=lambda k: -score[k]) if gains(k)]
+
+        candidates = rank(promised(models, promise_unbounded))[: SCREENED * most]
+        best = rank(promised([base, *candidates], promise))
         next_sets = [key for key in best if key not in self.hypotheses][:most]
         next_sets += [
             key - {effect} for key in best[:SIMPLER] for effect in key - self.torque_effects

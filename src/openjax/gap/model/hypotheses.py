@@ -243,11 +243,9 @@ def fit_single(replay: Replay, effect: str) -> SetFit:
     beside the others it is searched from there.
     """
     effects = in_order((effect, *replay.other_sizes))
-    start = _best_start(replay, effect)
-    fit = fit_set(replay, effects, start)
-    if forbidden(fit.theta, (effect,), replay.physics.vehicles[0]):
-        return fit_set(replay, effects, start, iterations=0)
-    return fit
+    start = _at(replay, effects, replay.alone(effects, _best_start(replay, effect)))
+    fit = _descend(start, ITERATIONS)
+    return start if forbidden(fit.theta, (effect,), replay.physics.vehicles[0]) else fit
 
 
 def in_order(effects: Collection[str]) -> tuple[str, ...]:
