@@ -106,18 +106,17 @@ def cross_validate(table: Table, model: Model) -> Validation:
     residuals = [np.concatenate([u @ columns, u[table.block_nuisances]]) for u, columns in each]
     return Validation(
         nats=np.array([-0.5 * (r @ r) for r in residuals]),
-        squares=_squares(table.error, coefficients),
+        squares=_squares(table.errors, coefficients),
         nuisance_sizes=-coefficients[:, table.nuisances[table.is_shared]],
         residuals=np.concatenate(residuals),
         starts=np.cumsum([0, *map(len, residuals)])[:-1],
     )
 
 
-def _squares(error: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """Squared errors (B, K) by their quadratic forms (B, K, C, C), with coefficients
-    (B, C).
-    """
-    return np.einsum("bkc,bc->bk", np.einsum("bkcd,bd->bkc", error, coefficients), coefficients)
+def _squares(errors: list, coefficients: np.ndarray) -> np.ndarray:
+    """Squared errors (B, K) of columns' errors [(C, T, K)] with coefficients (B, C)."""
+    each = zip(coefficients, errors, strict=True)
+    return np.array([np.square(np.tensordot(c, e, 1)).sum(0) for c, e in each])
 
 
 def ablate(
@@ -139,4 +138,4 @@ def ablate(
         coefficients[:, table.part[effect]] = 1.0
     if off is not None:
         coefficients[:, table.nuisances[off]] = 0.0
-    return _squares(table.error, coefficients)
+    return _squares(table.errors, coefficients)

@@ -1,13 +1,12 @@
 """Everything that a set of effects could still become, as small matrices: the case
 linearised around a fitted set.
 
-A table holds, for every second of flight, inner products of all columns that a decision
-may combine
-- what is left, its derivatives with respect to every parameter, what each further
-  effect would do
-as it was fitted alone, what each effect of the set does, and the nuisances - once
-whitened (likelihood) and once as errors of short predictions (gap). So adding, dropping
-and swapping effects on stretches left out costs nothing but linear algebra.
+A table holds, for every second of flight, inner products of all whitened columns that a
+decision may combine: what is left, its derivatives with respect to every parameter, what
+each further effect would do as it was fitted alone, what each effect of the set does, and
+the nuisances. Beside them stand the errors of short predictions that the columns make
+(gap). So adding, dropping and swapping effects on stretches left out costs nothing but
+linear algebra.
 
 Nuisances of the vehicle and its sensors are shared by all flights of the case and
 bounded: each stays within twice its usual size, and one that ends there is a finding.
@@ -39,8 +38,8 @@ class Table:
     fit: SetFit
     white: np.ndarray
     """(B, C, C) of the whitened columns: the likelihood."""
-    error: np.ndarray
-    """(B, logged of ERRORS, C, C) of the errors of short predictions: the gap."""
+    errors: list
+    """[(C, T, logged of ERRORS)]: errors of short predictions in each block: the gap."""
     rows: np.ndarray
     """(B,) rows that count."""
     track_of: np.ndarray
@@ -132,7 +131,7 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
     if points:
         predictions = replay.predict(np.array(points))
     white = []
-    error = []
+    errors = []
     rows = []
     track_of = []
     whole = []
@@ -149,7 +148,7 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
             flat = a.reshape(len(x), -1)
             whole.append(flat)
             white.append(flat @ flat.T)
-            error.append(np.einsum("ctk,dtk->kcd", b, b, optimize=True))
+            errors.append(b)
             rows.append(b.shape[1])
             track_of.append(number)
     first_step = 1 + len(index)
@@ -157,7 +156,7 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
     return Table(
         fit=fit,
         white=np.array(white),
-        error=np.array(error),
+        errors=errors,
         rows=np.array(rows),
         track_of=np.array(track_of),
         derivative={int(i): 1 + k for k, i in enumerate(index)},
