@@ -2,12 +2,12 @@
 of them fitted, then the most plausible set that isn't clearly worse.
 
 The score of a set of effects is its log predictive density on stretches left out
-(Vehtari, Gelman, Gabry 2017) plus the log prior odds of its effects. Chosen is the set
-of the largest prior odds among those that these flights can't tell from the best: the
-difference is within its standard errors, or too small to matter (the one-standard-error
-rule of Breiman et al. 1984, with a region of practical equivalence). How often each set
-is chosen when blocks of flight are weighed anew by a Bayesian bootstrap is its
-probability; named is the most probable one.
+(Vehtari, Gelman, Gabry 2017) plus the log prior odds of its effects. Only sets whose every
+effect adds to it are fitted. Chosen is the set of the largest prior odds among those that
+these flights can't tell from the best: the difference is within its standard errors, or the
+gap grows by less than what matters (the one-standard-error rule of Breiman et al. 1984, with
+a region of practical equivalence). How often each set is chosen when blocks of flight are
+weighed anew by a Bayesian bootstrap is its probability; named is the most probable one.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ from openjax.gap.model.table import Model, Table, build, with_effects
 from openjax.gap.posterior import LARGEST
 
 NOTHING = frozenset()
-# Sets that are fitted in full, of those that the model promises as linearised around
-# nothing, and then around the best of these.
+# Sets that are fitted in full, of those that the model promises as linearised around what
+# other estimators named, and then around the best of these.
 FITTED = 10
 FITTED_AGAIN = 6
 SCREENED = 4  # times as many are weighed with bounded nuisances before that
@@ -130,7 +130,6 @@ def settle(search: Search) -> tuple[dict[frozenset, float], Hypothesis, SetFit]:
 def search_sets(evidence: Evidence) -> Search:
     """The sets that were worth fitting."""
     search = Search(evidence, testable(evidence))
-    search.alone()
     search.enumerate(search.base, FITTED)
     search.enumerate(search.best, FITTED_AGAIN, search.beyond_bounds())
     search.fit_without_dropouts()
@@ -210,11 +209,6 @@ class Search:
         for new in rest - set(near.effects):  # as it was alone
             start[places((new,))] = self.singles[new].theta[places((new,))]
         return fit_set(near.replay, in_order(key), start)
-
-    def alone(self) -> None:
-        """Judge the effects that explain most alone."""
-        best = sorted(self.singles, key=lambda e: -self.singles[e].score)[:SIMPLER]
-        self.of_sets([self.torque_effects | {effect} for effect in best], self.base.fit)
 
     def beyond_bounds(self) -> frozenset:
         """Effects that leave their physical bounds in the visited set of the largest
