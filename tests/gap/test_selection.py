@@ -153,22 +153,34 @@ def test_a_plane_whose_place_is_not_known_acts_if_its_push_is():
     assert not practical(weak)
 
 
+def test_a_set_is_fitted_only_if_each_of_its_effects_adds_something():
+    """Beside a wind a mass adds nothing, and a drag that alone says nothing does."""
+    promises = {"": 0.0, "m": 5.0, "w": 20.0, "d": -2.0, "mw": 19.0, "dw": 25.0, "dmw": 24.5}
+    base = frozenset({"lag"})
+    score = {base.union(key): nats for key, nats in promises.items()}
+    assert selection.worth_fitting(score, base) == [base.union(key) for key in ("dw", "w", "m")]
+
+
 @pytest.mark.parametrize(("alone", "begins"), [(-14.0, 0.4), (0.6, 0.6)])
 def test_an_effect_that_alone_is_forbidden_begins_at_its_start(monkeypatch, alone, begins):
     """Where rotors differ a floor alone takes what it can of that, and pulls: beside them
     it is searched from its start.
     """
 
-    def fit(replay, effects, start, iterations=1):
-        theta = start.copy()
-        if iterations:
-            theta[PLACE["ground_effect", "strength"]] = alone
+    def at(replay, effects, theta):
+        return SimpleNamespace(theta=theta)
+
+    def descend(fit, iterations):
+        theta = fit.theta.copy()
+        theta[PLACE["ground_effect", "strength"]] = alone
         return SimpleNamespace(theta=theta)
 
     start = ABSENT.copy()
     start[places(("ground_effect",))] = 0.4, 0.012
-    monkeypatch.setattr(hypotheses, "fit_set", fit)
+    monkeypatch.setattr(hypotheses, "_at", at)
+    monkeypatch.setattr(hypotheses, "_descend", descend)
     monkeypatch.setattr(hypotheses, "_best_start", lambda *_: start)
-    replay = SimpleNamespace(other_sizes={}, physics=SimpleNamespace(vehicles=(load_vehicle(),)))
+    physics = SimpleNamespace(vehicles=(load_vehicle(),))
+    replay = SimpleNamespace(other_sizes={}, physics=physics, alone=lambda _, theta: theta)
     single = hypotheses.fit_single(replay, "ground_effect")
     assert single.theta[PLACE["ground_effect", "strength"]] == begins

@@ -91,12 +91,16 @@ def test_a_block_left_out_is_judged_by_its_marginal_density(columns):
     white = np.array([x @ x.T for x in rows])
     shared = np.array([False])
     fit = SimpleNamespace(effects=(), replay=SimpleNamespace(absent=ABSENT), theta=ABSENT)
-    error = np.zeros((2, 1, 2, 2))
-    table = Table(fit, white, error, None, np.arange(2), {}, {}, {}, shared, rows)
+    errors = [np.arange(12.0).reshape(2, 3, 2), np.ones((2, 4, 2))]
+    table = Table(fit, white, errors, None, np.arange(2), {}, {}, {}, shared, rows)
     model = Model((), np.array([], int), np.zeros(0), np.zeros((0, 0)))
-    for (y, n), nats in zip(rows, cross_validate(table, model).nats, strict=True):
+    found = cross_validate(table, model)
+    for (y, n), nats in zip(rows, found.nats, strict=True):
         expected = -0.5 * y @ np.linalg.solve(np.eye(len(y)) + np.outer(n, n), y)
         assert nats == pytest.approx(expected, rel=1e-9)
+    for (y, n), squares, error in zip(rows, found.squares, errors, strict=True):
+        size = y @ n / (1.0 + n @ n)
+        np.testing.assert_allclose(squares, ((error[0] - size * error[1]) ** 2).sum(0))
 
 
 def test_screening_promises_what_a_fit_does_where_no_nuisance_is_at_its_bound(columns):

@@ -148,6 +148,18 @@ def testable(evidence: Evidence) -> dict[str, SetFit]:
     }
 
 
+def worth_fitting(score: dict[frozenset, float], base: frozenset) -> list[frozenset]:
+    """Of sets that hold `base` those that promise more than it and than any part of them, the
+    best first: an effect that adds nothing to the others is in no set that is chosen.
+    """
+
+    def gains(key: frozenset) -> bool:
+        parts = [key - {effect} for effect in key - base]
+        return all(score[key] > score.get(part, -np.inf) for part in (base, *parts))
+
+    return [key for key in sorted(score, key=lambda key: -score[key]) if gains(key)]
+
+
 @dataclass(eq=False)
 class Search:
     """`singles` {effect: its fit alone} are those that may act; `hypotheses` {effects:
@@ -229,7 +241,7 @@ class Search:
         models = {key: self._model(table, key) for key in self.sets() if not key & without}
         base = self.torque_effects
 
-        def promised(keys, promise_of) -> dict[frozenset, float]:
+        def promises(keys, promise_of) -> dict[frozenset, float]:
             return {
                 k: promise_of(table, models[k])
                 - len(models[k].free)
@@ -238,19 +250,8 @@ class Search:
                 for k in keys
             }
 
-        def rank(score: dict[frozenset, float]) -> list[frozenset]:
-            """Those that promise more than nothing and than any part of them, the best first:
-            an effect that adds nothing to the others is in no set that is chosen.
-            """
-
-            def gains(key):
-                parts = [key - {e} for e in key - base]
-                return all(score[key] > score.get(part, -np.inf) for part in (base, *parts))
-
-            return [k for k in sorted(score, key=lambda k: -score[k]) if gains(k)]
-
-        candidates = rank(promised(models, promise_unbounded))[: SCREENED * most]
-        best = rank(promised([base, *candidates], promise))
+        candidates = worth_fitting(promises(models, promise_unbounded), base)[: SCREENED * most]
+        best = worth_fitting(promises([base, *candidates], promise), base)
         next_sets = [key for key in best if key not in self.hypotheses][:most]
         next_sets += [
             key - {effect} for key in best[:SIMPLER] for effect in key - self.torque_effects
