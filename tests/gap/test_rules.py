@@ -13,7 +13,7 @@ from openjax.gap.decision import DECISION
 from openjax.gap.diagnosis import _beside_segments, _runner_up, worth_naming
 from openjax.gap.probabilities import agreeing, probabilities
 from openjax.gap.report import Estimate, Report
-from openjax.gap.report.rules import NOTHING, broken_rules
+from openjax.gap.report.rules import broken_rules
 from openjax.gap.shares import Gap, Share, Split
 from openjax.vehicle.effects import EFFECTS
 
@@ -87,7 +87,7 @@ def test_probabilities_agree_with_what_is_named(seed):
     assert sum(agreed.values()) == pytest.approx(1.0) and min(agreed.values()) >= 0.0
     named = max(agreed[e] for e in names[:2])
     assert named >= max(p for e, p in agreed.items() if e not in names[:2]) - 1e-12
-    assert sure < 0.5 or agreed["none"] <= 0.2 + 1e-12
+    assert sure <= DECISION.most_of_gap or agreed["none"] <= DECISION.none_beside + 1e-12
 
 
 def test_an_unknown_that_may_act_and_isnt_the_largest_is_no_reason_for_nothing():
@@ -95,10 +95,10 @@ def test_an_unknown_that_may_act_and_isnt_the_largest_is_no_reason_for_nothing()
     well.
     """
     chance = probabilities({"rotor_drag": 1.0}, {"rotor_drag": 1.0}, 0.6, {})
-    assert chance["none"] > 0.2
+    assert chance["none"] > DECISION.none_beside
     named = agreeing(chance, ["rotor_drag", "unknown"], 0.9)["rotor_drag"]
     # the most that may be said is how reliable choices are, less what nothing keeps
-    assert named > 0.95 * DECISION.reliability * (1.0 - NOTHING)
+    assert named > 0.95 * DECISION.reliability * (1.0 - DECISION.none_beside)
 
 
 def test_what_has_no_share_or_makes_predictions_worse_is_not_named():

@@ -20,7 +20,6 @@ from openjax.gap.planning.beliefs import acts_in_physics
 from openjax.gap.probabilities import agreeing, probabilities
 from openjax.gap.reference import OF_DAYS, borne_out, differs, join, read_reference, trimmed_before
 from openjax.gap.report import Report
-from openjax.gap.report.rules import LEAST_SHARE
 from openjax.gap.residual import Check, check_residual
 from openjax.gap.selection import Selection, select
 from openjax.gap.shares import Split, split
@@ -89,7 +88,7 @@ def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
     old = of_days | forbidden(theta, selection.effects, vehicle)
     if check.mostly_unknown:  # what acts is something else
         old |= set(selection.effects) - selection.search.torque_effects
-    candidates = [e for e, p in acting.items() if p >= 0.5 and e not in old]
+    candidates = [e for e, p in acting.items() if p >= DECISION.least_probability and e not in old]
     parts = worth_naming(
         lambda names: split(evidence, selection, check.excess, names),
         candidates,
@@ -158,7 +157,7 @@ def worth_naming(
         dropouts = [
             e
             for e in optional
-            if parts.reach(e) < least_share(e) or parts.effects[e].value < LEAST_SHARE
+            if parts.reach(e) < least_share(e) or parts.effects[e].value < DECISION.least_share
         ]
         if not dropouts and parts.gap.reduction < DECISION.least_gap:
             dropouts = [min(optional, key=lambda e: parts.effects[e].value)]
@@ -171,7 +170,7 @@ def worth_naming(
 
 def least_share(effect: str) -> float:
     """Of the gap's square that an effect must take."""
-    return DECISION.form_error if path_of(effect) == "physics" else LEAST_SHARE
+    return DECISION.form_error if path_of(effect) == "physics" else DECISION.least_share
 
 
 def words(check: Check, parts: Split) -> tuple[str, ...]:

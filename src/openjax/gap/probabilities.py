@@ -8,7 +8,6 @@ remains goes to sets chosen otherwise, to nothing and to the unknown.
 from collections.abc import Collection
 
 from openjax.gap.decision import DECISION
-from openjax.gap.report.rules import NOTHING, SURE_SHARE
 from openjax.vehicle.effects import EFFECTS
 
 
@@ -63,7 +62,8 @@ def agreeing(
     """
     chance = dict(chance)
     answer = max(answers, key=lambda name: chance[name])
-    most = max(min(no_gap, NOTHING if sure > SURE_SHARE else 1.0), alike(chance))
+    beside = DECISION.none_beside if sure > DECISION.most_of_gap else 1.0
+    most = max(min(no_gap, beside), alike(chance))
     if chance["none"] > most:
         chance[answer] += chance["none"] - most
         chance["none"] = most

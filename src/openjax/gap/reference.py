@@ -25,10 +25,6 @@ from openjax.gap.trims import Change
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.effects.effect import VERY_RARE
 
-# Of what is left of a case's flights before any effect: by which they must be better
-# without what the reference has. A lag of 70 ms and motors at a limit made it .2 and .4
-# % of themselves.
-SPOKEN_AGAINST = 0.01
 ROUNDS = 3  # of the fit, between which nuisances are worked out anew
 # What trims of a day look like, and so nothing that another day has as well.
 OF_DAYS = tuple(e for e, card in CARDS.items() if card.trim is not None)
@@ -76,7 +72,7 @@ def borne_out(evidence: Evidence) -> Baseline:
         y[None] - p for y, p in zip(replay.measurements, replay.predict(thetas), strict=True)
     ]
     squares = np.diag(replay.grams(residuals).sum(0))
-    candidates = np.flatnonzero(squares <= (1.0 + SPOKEN_AGAINST) * squares.min())
+    candidates = np.flatnonzero(squares <= (1.0 + DECISION.reference_loss) * squares.min())
     return with_some(
         baseline, subsets[max(candidates, key=lambda k: (len(subsets[k]), -squares[k]))]
     )

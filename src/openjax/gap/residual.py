@@ -35,9 +35,6 @@ HORIZONS = {
     "estimator": (0.1, "attitude and gyroscope disagree"),
     "position": (0.1, "position and velocity disagree"),
 }
-# Share of what grew that effects leave where they aren't what acts: those named beside
-# an unknown cause left .71 to 1, those that act .54 at most (seeds 890 to 893).
-MOSTLY = 0.65
 # Of HORIZONS what forces and torques leave, and so what another vehicle's gusts shake;
 # where there are any, rows under it don't count.
 OF_MOTION = ("velocity", "rates")
@@ -112,7 +109,7 @@ def check_residual(evidence: Evidence, fit: SetFit, nothing: SetFit) -> Check:
             unexplained_share(squares[n], reference[n] ** 2, squares_of_nothing[n])
             for n in _larger(measures, reference, name)
         ]
-        mostly_unknown = max(shares, default=0.0) > MOSTLY
+        mostly_unknown = max(shares, default=0.0) > DECISION.rest_share
     finding = HORIZONS.get(name, (0.0, ""))[1]
     check = Check(measures, finding, p_value, np.zeros(9), reference, by_reference=by_reference)
     if not check.rejects:

@@ -94,7 +94,7 @@ class RateLoop(Channel):
         nats = 0.5 * (change / error) ** 2 - np.log(PRIOR[0] / error)
         chance = norm.cdf((change - DECISION.form_error) / error) * (1.0 - DECISION.unknown)
         odds = {e: chance[nats + CARDS[e].log_odds > 0.0].max(initial=0.0) for e in self.names}
-        return {e: float(p) for e, p in odds.items() if p > 0.5}
+        return {e: float(p) for e, p in odds.items() if p > DECISION.least_probability}
 
     def undetectable(self) -> list[str]:
         detectable = PRIOR[0] > 2.0 * DECISION.standard_errors * self.error[[0, 3]].min()

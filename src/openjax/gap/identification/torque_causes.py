@@ -73,7 +73,8 @@ class Torques:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """The effects that are likelier to act than not."""
-        return tuple(e for e in CARDS if self.probability.get(e, 0.0) > 0.5)
+        chance = self.probability
+        return tuple(e for e in CARDS if chance.get(e, 0.0) > DECISION.least_probability)
 
     @cached_property
     def untestable(self) -> frozenset[str]:

@@ -3,6 +3,7 @@
 from collections.abc import Collection
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 
+from openjax.gap.decision import DECISION
 from openjax.gap.identification.corrections import corrections
 from openjax.gap.identification.quantities import Identification, Quantity
 from openjax.gap.model.library import CARDS
@@ -22,9 +23,6 @@ VERDICTS_SINCE = {
     "not_testable": "No change is seen, but these flights could not have shown most changes.",
 }
 """The same where a reference of the vehicle was given."""
-MOST = 0.5
-"""Share of the gap below which what is named isn't most of it."""
-WIDEST = 10.0  # ratio of an interval's ends from which on it tells no size
 
 
 @dataclass(frozen=True)
@@ -55,7 +53,7 @@ class Estimate:
         """True if the interval tells the order of magnitude."""
         near, far = sorted(map(abs, self.interval90))
         one_sign = self.interval90[0] * self.interval90[1] > 0.0
-        return not one_sign or far <= WIDEST * near
+        return not one_sign or far <= DECISION.size_ratio * near
 
     @property
     def unusual(self) -> bool:
@@ -264,7 +262,7 @@ class Report:
             f"{self.class_of(effect).replace('_', ' ')} ({100 * value:.0f} %)"
             for effect, value in zip(self.named, values, strict=True)
         )
-        if sum(values) < MOST:
+        if sum(values) < DECISION.most_of_gap:
             rest = {
                 "unexplained": self.shares.unexplained.value,
                 "of sensors and clocks": self.shares.sensors.value,

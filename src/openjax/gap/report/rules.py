@@ -8,12 +8,9 @@ import numpy as np
 from openjax.gap.decision import DECISION
 from openjax.gap.identification.estimates import TORQUES
 from openjax.gap.identification.quantities import TALKED_OF
-from openjax.gap.report.report import VERDICTS, VERDICTS_SINCE, WIDEST, Report
+from openjax.gap.report.report import VERDICTS, VERDICTS_SINCE, Report
 from openjax.vehicle.effects import EFFECTS
 
-LEAST_SHARE = 0.005  # of the gap: less is shown as nothing
-SURE_SHARE = 0.5  # lower end of a share's interval from which something acts
-NOTHING = 0.2  # largest probability of "none" beside such a share
 ROUNDING = 1e-9
 AGREE = (VERDICTS["none"], VERDICTS_SINCE["none"])
 CHANGED = "The vehicle changed"
@@ -34,7 +31,7 @@ def _testable(report: Report) -> Iterator[str]:
             yield f"{effect} is named and not testable"
 
 
-def _told(report: Report) -> set[str]:
+def _by_torques(report: Report) -> set[str]:
     """Effects that the torques name, whatever short predictions show of them."""
     does = report.identification
     return set(TORQUES) if does is not None and does.trustworthy else set()
@@ -45,7 +42,7 @@ def _shares(report: Report) -> Iterator[str]:
     for effect in report.named:
         share = report.shares.effects[effect]
         low, high = share.interval90
-        if min(high, share.value) < LEAST_SHARE and effect not in _told(report):
+        if min(high, share.value) < DECISION.least_share and effect not in _by_torques(report):
             yield f"{effect} is named with a share of {share.value:.3f} [{low:.3f}, {high:.3f}]"
         if not low - ROUNDING <= share.value <= high + ROUNDING:
             yield f"{effect} has a share of {share.value:.3f} outside of [{low:.3f}, {high:.3f}]"
@@ -53,7 +50,7 @@ def _shares(report: Report) -> Iterator[str]:
 
 def _predictions(report: Report) -> Iterator[str]:
     """Named effects make held-out predictions no worse."""
-    if set(report.named) - _told(report) and report.gap.reduction < 0.0:
+    if set(report.named) - _by_torques(report) and report.gap.reduction < 0.0:
         yield f"{', '.join(report.named)}: held-out predictions get worse"
 
 
@@ -83,7 +80,8 @@ def _likelihood(report: Report) -> Iterator[str]:
     if second and chance.get(second, 0.0) > likelihood + ROUNDING:
         yield f"the runner-up {second} ({chance[second]:.2f}) is likelier than {', '.join(answers)}"
     sure = max((report.shares.effects[e].interval90[0] for e in report.named), default=0.0)
-    if sure > SURE_SHARE and chance.get("none", 0.0) > NOTHING + ROUNDING:
+    is_sure = sure > DECISION.most_of_gap
+    if is_sure and chance.get("none", 0.0) > DECISION.none_beside + ROUNDING:
         yield f"none ({chance['none']:.2f}) beside a share of at least {sure:.2f}"
 
 
@@ -101,7 +99,7 @@ def _one_verdict(report: Report) -> Iterator[str]:
     differs = [*report.named, *report.departures]
     if agrees and (differs or "unknown" in report.effects):
         yield f"all agrees, and {', '.join(differs) or 'something'} differs"
-    if agrees and report.gap.before > report.gap.floor * (1.0 + SURE_SHARE):
+    if agrees and report.gap.before > report.gap.floor * (1.0 + DECISION.loud_gap):
         yield f"all agrees, and the gap is {report.gap.before:.2f}"
     says_no_change = NO_CHANGE in text or VERDICTS_SINCE["none"] in text
     if says_no_change and (CHANGED in text or (report.named and report.reference)):
@@ -138,9 +136,8 @@ def _values(report: Report) -> Iterator[str]:
             end = float(high)
             if start == end:
                 yield f"an interval has no width: {value} [{low}, {high}]"
-            if start * end > 0.0 and max(abs(start), abs(end)) > WIDEST * min(
-                abs(start), abs(end)
-            ) * (1.0 + 1e-3):
+            near, far = sorted((abs(start), abs(end)))
+            if start * end > 0.0 and far > DECISION.size_ratio * near * (1.0 + 1e-3):
                 yield f"an interval is no size: {value} [{low}, {high}]"
     for effect, estimates in report.parameters.items():
         for name, estimate in estimates.items():

@@ -16,8 +16,9 @@ import numpy as np
 from openjax.errors import TooLittle, UserError
 from openjax.flights.case import LogFolder
 from openjax.flights.flight import Case, Issue
+from openjax.gap.decision import DECISION
 from openjax.gap.trims.causes import ROTOR_PLACES, SIDES, hypotheses_of
-from openjax.gap.trims.change import SHOWN, Change, Interval
+from openjax.gap.trims.change import Change, Interval
 from openjax.gap.trims.days import (
     battery_of,
     by_day,
@@ -100,7 +101,7 @@ def change_between(
 
     return Change(
         name=name,
-        changed=evidence.probability > SHOWN,
+        changed=evidence.probability > DECISION.least_probability,
         probability=evidence.probability,
         rotors=as_logged(place),
         side=ROTOR_PLACES[place[0]] if len(place) == 1 else SIDES.get(place, ""),
@@ -126,4 +127,4 @@ def _intervals(difference: np.ndarray, reach: np.ndarray) -> dict[str, Interval]
     }
 
 
-__all__ = ["SHOWN", "Change", "Interval", "change_between", "compare", "read"]
+__all__ = ["Change", "Interval", "change_between", "compare", "read"]

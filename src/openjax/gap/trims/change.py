@@ -8,8 +8,6 @@ from openjax.flights.flight import Issue
 from openjax.gap.trims.causes import CAUSES
 from openjax.gap.trims.figures import FIGURES, TRIMS, FlightFigures
 
-SHOWN = 0.5  # probability from which on something is said to have changed
-
 
 @dataclass(frozen=True)
 class Interval:

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from openjax.gap.decision import DECISION
 from openjax.gap.trims.causes import CAUSES, SIDES, Hypotheses, trims_with
-from openjax.gap.trims.change import SHOWN, Interval
+from openjax.gap.trims.change import Interval
 
 # before any flight speaks, a change is as probable as none
 PRIOR_CHANGED = 0.5
@@ -31,14 +32,16 @@ class Weighed:
         what is most probable.
         """
         best = max(self.places, key=lambda p: self.places[p])
-        if self.places[best] > 0.5:
+        if self.places[best] > DECISION.least_probability:
             return best, [best]
         sides = {
             side: [side, side[:1], side[1:]] for side, name in SIDES.items() if name != "diagonal"
         }
         shares = {side: sum(self.places[p] for p in within) for side, within in sides.items()}
         side = max(shares, key=lambda p: shares[p])
-        return (side, sides[side]) if shares[side] > 0.5 else (best, [best])
+        if shares[side] > DECISION.least_probability:
+            return side, sides[side]
+        return best, [best]
 
     def _within(self, places: list[tuple[int, ...]]) -> np.ndarray:
         return np.isin(self.hypotheses.place, [self.hypotheses.places.index(p) for p in places])
@@ -114,7 +117,8 @@ def least_shown(
             middle = 0.5 * (low + high)
             change = np.full(len(scale), np.nan)
             change[: len(trims)] = trims_with(mixer, trims, 1.0 + middle * (np.arange(4) == rotor))
-            is_shown = weigh(hypotheses, change, scale, freedom).probability > SHOWN
+            chance = weigh(hypotheses, change, scale, freedom).probability
+            is_shown = chance > DECISION.least_probability
             low, high = (low, middle) if is_shown else (middle, high)
         worst = max(worst, high / (1.0 + high))
     return worst
