@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from openjax.flights.track import Track
-from openjax.gap.model.wakes import ASIDE, CLEAR, LINGERS, LOUDER, louder_in, under_another
+from openjax.gap.decision import DECISION
+from openjax.gap.model.wakes import ASIDE, LINGERS, louder_in, under_another
 
 DT = 0.01
 ROWS = 1000
@@ -43,7 +44,8 @@ def test_only_gusts_that_are_louder_under_another_vehicle_are_found(strength):
         loud = np.repeat(rng.uniform(0.7, 1.4, ROWS // 100), 100) * np.where(chosen, strength, 1.0)
         left.append((loud[:, None] * rng.standard_normal((ROWS, 2)))[20:])
     ratio, errors = louder_in(tracks, rows, left)
-    assert (errors > CLEAR and ratio > LOUDER) == (strength > 1.0)
+    is_louder = errors > DECISION.clear_errors and ratio > DECISION.wake_loudness
+    assert is_louder == (strength > 1.0)
     assert ratio == pytest.approx(strength**2, rel=0.3)
 
 

@@ -20,7 +20,6 @@ from openjax.flights.shapes import Chosen
 from openjax.flights.track import Track, specific_force_of, to_body
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
-from openjax.gap.identification.quantities import CLEAR
 from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.hypotheses import SetFit, without_nuisances
 from openjax.gap.model.nuisances import SIZE
@@ -252,7 +251,7 @@ def _larger(measures: dict[str, float], reference: dict[str, float], finding: st
         for n in OF_MOTION
         if n in measures
         and n in reference
-        and (n == finding or np.log(measures[n] / reference[n]) > CLEAR * days[n])
+        and (n == finding or np.log(measures[n] / reference[n]) > DECISION.clear_errors * days[n])
     ]
 
 

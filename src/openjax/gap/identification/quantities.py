@@ -25,11 +25,12 @@ SAMPLES = (
     "a row's motors are one sample of a loop that runs several times within it; log their "
     "means at 100 Hz, or every sample at 500 Hz"
 )
-TURNS = 8.0  # standard deviations of noise: below, rows show a loop that answers noise
-CLOCK = 0.010  # s: rows off by more are worth a sentence
 POSITIVE = ("spin_up", "spin_down", "roll_gain", "pitch_gain", "yaw_gain")
-CLEAR = 3.0  # standard deviations from the simulator's value
-MATTERS = {"motor_lag": 0.006, "inertia": 0.15, "yaw_torque": 0.2}
+MATTERS = {
+    "motor_lag": DECISION.lag_departure,
+    "inertia": DECISION.inertia_departure,
+    "yaw_torque": DECISION.yaw_departure,
+}
 """s, and shares: differences from which training should know, by effect."""
 
 
@@ -95,7 +96,7 @@ class Quantity:
         least = MATTERS.get(self.effect)
         if least is None or self.simulator <= 0.0 or self.value <= 0.0:
             return False
-        error = CLEAR / REACH * np.log(self.interval90[1] / self.value)
+        error = DECISION.clear_errors / REACH * np.log(self.interval90[1] / self.value)
         ratio = abs(np.log(self.value / self.simulator))
         return bool(ratio > error and abs(self.value - self.simulator) > least)
 
@@ -285,7 +286,7 @@ def doubts(records: list[Track], fit: TorqueFit, one_clock: bool) -> tuple[str, 
         )
     if any(r.hides_ticks and r.samples for r in records):
         reasons.append(SAMPLES)
-    if any(r.hides_ticks for r in records) and fit.turning[:2].max() < TURNS:
+    if any(r.hides_ticks for r in records) and fit.turning[:2].max() < DECISION.least_turning:
         reasons.append("the vehicle hardly turns; fly the segments yaw, agile or step")
     if np.isclose(fit.value[3:6], SEARCHED[1][0], rtol=0.02).any() and not reasons:
         reasons.append("the body hardly answers the motors as they are logged")
@@ -296,7 +297,7 @@ def _remarks(fit: TorqueFit) -> tuple[str, ...]:
     remarks = []
     clock = fit.clock
     error = float(np.sqrt(fit.covariance[2, 2]))
-    if abs(clock) > CLOCK + 2.0 * error:
+    if abs(clock) > DECISION.clock_remark + DECISION.standard_errors * error:
         direction = "later" if clock > 0.0 else "earlier"
         remarks.append(f"motors answer {1e3 * abs(clock):.0f} ms {direction} than logged")
     return tuple(remarks)

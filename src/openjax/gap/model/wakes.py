@@ -22,6 +22,7 @@ from scipy.stats import norm, t
 
 from openjax.flights.shapes import Chosen
 from openjax.flights.track import Track
+from openjax.gap.decision import DECISION
 from openjax.gap.model.hypotheses import SetFit, fit_set, fit_single, without_nuisances
 from openjax.gap.model.replay import BLOCK, GROUPS, SKIP, Replay
 
@@ -29,18 +30,12 @@ ABOVE = (0.05, 1.5)  # m, how far above the other vehicle flies
 ASIDE = 0.2  # m, to the side: a wake's width at a metre below, and its wandering
 LINGERS = 0.3  # s: a wake falls with some 2 m/s, and sensors and motors answer
 SHORTEST = 0.1  # s of a visit, or of a stretch elsewhere, that is compared
-FEWEST = 3  # of each
 # s of a track elsewhere; below, other tracks of the case are asked as well
 FEWEST_HERE = 2.0
-CLEAR = 3.0  # standard errors
-# standard errors beyond which the test, whose tails nobody knows, says no more
-SURE = 5.0
-LOUDER = 1.3  # times the mean square elsewhere
 SPEEDS = (4.0, 2.5, 1.5)
 """m/s, at which air falls: of the disc of a vehicle of 30 g 4.3, by momentum theory,
 and less below where the jet has widened.
 """
-LATER = 4.0  # nats by which one of these must be better than a wake at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +67,7 @@ def fit_wake(replay: Replay, effect: str) -> SetFit:
     at_once = fit_single(replay, effect)
     late = [fit_single(with_late_wakes(replay, speed), effect) for speed in SPEEDS]
     best = max(late, key=lambda fit: fit.score)
-    return best if best.score > at_once.score + LATER else at_once
+    return best if best.score > at_once.score + DECISION.wake_nats else at_once
 
 
 def with_late_wakes(replay: Replay, speed: float) -> Replay:
@@ -126,9 +121,9 @@ def read_gusts(fit: SetFit) -> Gusts:
             ratio, errors = louder_in(
                 replay.tracks, rows, [w[:, list(axes)] for w in innovations_of_tracks]
             )
-            if errors > CLEAR and ratio > LOUDER:
+            if errors > DECISION.clear_errors and ratio > DECISION.wake_loudness:
                 louder[axes] = ratio
-                far = max(far, min(errors, SURE))
+                far = max(far, min(errors, DECISION.wake_errors))
     return Gusts(rows, louder, 0.5 * far**2)
 
 
@@ -151,9 +146,9 @@ def louder_in(
             inside += _stretches(squares, inside_rows, track.dt)
         near = inside_rows.any() and (~inside_rows).sum() * track.dt > FEWEST_HERE
         (outside if near else aside).extend(elsewhere)
-    if len(outside) < FEWEST:
+    if len(outside) < DECISION.wake_visits:
         outside = outside + aside
-    if min(len(inside), len(outside)) < FEWEST:
+    if min(len(inside), len(outside)) < DECISION.wake_visits:
         return 1.0, 0.0
     parts = [np.log(np.maximum(values, 1e-12)) for values in (inside, outside)]
     spread = np.array([part.var(ddof=1) / len(part) for part in parts]) + 1e-12

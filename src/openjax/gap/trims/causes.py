@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm, qmc
 
+from openjax.gap.decision import DECISION
 from openjax.gap.trims.figures import PLACES, TRIMS
 
 
@@ -53,12 +54,6 @@ CAUSES = {
 LOOP_WITH_MOTORS = 0.3  # standard deviation: motors move the estimate of the gain too
 # mean and standard deviation of the rise of the logarithm with a damage
 SHAKES = (0.4, 0.4)
-USUAL_CHANGE = 0.15  # of a rotor's command, or of the weight
-STRONGER = 0.15  # share of changes the other way: a mended rotor, a weight taken off
-# of each trim of a cause: real changes don't follow their pattern exactly
-INEXACT = 0.25
-# a second rotor that changed by less than this share of the first isn't one
-LEAST_PARTNER = 0.25
 DRAWS = 2048  # of a cause's size and pattern
 
 ROTOR_PLACES = ("front right", "rear right", "rear left", "front left")
@@ -93,8 +88,9 @@ class _Draws:
     def __init__(self, mixer: np.ndarray, trims: np.ndarray):
         # a normal's quantiles at the very ends are infinite
         even = np.clip(qmc.Sobol(11, seed=0).random(DRAWS), 1e-6, 1 - 1e-6)
-        sign = np.where(even[:, 2] < STRONGER, -1.0, 1.0)
-        self.sizes = np.abs(norm.ppf(0.5 + 0.5 * even[:, :2])) * USUAL_CHANGE * sign[:, None]
+        sign = np.where(even[:, 2] < DECISION.mended, -1.0, 1.0)
+        usual = DECISION.usual_change * sign[:, None]
+        self.sizes = np.abs(norm.ppf(0.5 + 0.5 * even[:, :2])) * usual
         self.places, self.normal = even[:, 3:5], norm.ppf(even[:, 5:])
         self.mixer = mixer
         self.trims = trims
@@ -121,7 +117,8 @@ class _Draws:
         inexactly.
         """
         change = trims_with(self.mixer, self.trims, np.maximum(factors, 0.2))
-        return dict(zip(TRIMS, (change * (1.0 + INEXACT * self.normal[:, :4])).T, strict=True))
+        change = change * (1.0 + DECISION.pattern_error * self.normal[:, :4])
+        return dict(zip(TRIMS, change.T, strict=True))
 
 
 def trims_with(mixer: np.ndarray, trims: np.ndarray, factors: np.ndarray) -> np.ndarray:
@@ -146,13 +143,13 @@ def hypotheses_of(mixer: np.ndarray, trims: np.ndarray) -> Hypotheses:
             continue
         size = cause_card.usual[0] + cause_card.usual[1] * draws.normal[:, 0]
         each = {
-            n: size * (1 + INEXACT * draws.normal[:, k + 1])
+            n: size * (1 + DECISION.pattern_error * draws.normal[:, k + 1])
             for k, n in enumerate(cause_card.figures)
         }
         if cause == "motors":
             each["loop_gain"] = LOOP_WITH_MOTORS * size * draws.normal[:, 2]
         draws.add(cause, 1.0, each, (), size)
-    anything = USUAL_CHANGE / 2 * draws.normal[:, :4]
+    anything = DECISION.usual_change / 2 * draws.normal[:, :4]
     each = dict(zip(TRIMS, anything.T, strict=True))
     draws.add("something else", 1.0, each, (), np.abs(anything).sum(1))
     parts = zip(*draws.parts, strict=True)
@@ -175,7 +172,8 @@ def _rotors(draws: _Draws) -> None:
         factors[:, pair] += sizes
         places = np.full(DRAWS, draws.place_of[pair])
         for one, other in ((0, 1), (1, 0)):
-            is_single = np.abs(sizes[:, other]) < LEAST_PARTNER * np.abs(sizes[:, one])
+            least = DECISION.least_partner * np.abs(sizes[:, one])
+            is_single = np.abs(sizes[:, other]) < least
             places[is_single] = pair[one]
         share = 0.05 if side == "diagonal" else 0.225
         draws.add("two rotors weaker", share, draws.trims_of(factors), places, losses.sum(1))

@@ -15,13 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
+from openjax.gap.decision import DECISION
 from openjax.gap.trims.figures import FIGURES, PLACES, FlightFigures
 
 DAY_SPREAD, WITHIN_DAY = np.array([(figure.day, figure.within) for figure in FIGURES.values()]).T
 HOVER = PLACES["hover"]
-PRIOR_DAYS = 6.0  # days of experience that this prior is worth
-# of hover: roll and pitch trims further apart were flown on different days
-SAME_DAY = 0.012
 # 1/V of hover, prior mean and standard deviation: thrust commands are what the
 # firmware's battery compensation makes of them, and duty cycles with their voltage are
 # turned into thrust by its map.
@@ -41,7 +39,8 @@ def days_told_apart(figures: Sequence[FlightFigures]) -> list[FlightFigures]:
         return list(figures)
     trims = np.array([f.all()[0][1:3] for f in figures])
     error = max(float(np.median([f.all()[1][1:3].max() for f in figures])), 1e-9)
-    groups = fcluster(linkage(trims, "complete"), max(SAME_DAY, 3.0 * error), "distance")
+    apart = max(DECISION.same_day, DECISION.clear_errors * error)
+    groups = fcluster(linkage(trims, "complete"), apart, "distance")
     return [
         dataclasses.replace(f, day=f"{f.day}#{g}") for f, g in zip(figures, groups, strict=True)
     ]
@@ -149,8 +148,8 @@ def spread_of_days(*sets: Days) -> tuple[np.ndarray, np.ndarray]:
     """Standard deviation (F,) of normal days and the degrees of freedom (F,) behind it:
     the prior and what the days of each set show.
     """
-    freedom = np.full(len(FIGURES), PRIOR_DAYS)
-    total = PRIOR_DAYS * DAY_SPREAD**2
+    freedom = np.full(len(FIGURES), DECISION.prior_days)
+    total = DECISION.prior_days * DAY_SPREAD**2
     for one in sets:
         freedom = freedom + np.maximum(one.count - 1, 0)
         total = total + np.nansum((one.days - one.mean) ** 2, 0)

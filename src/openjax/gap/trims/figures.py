@@ -13,15 +13,13 @@ from openjax.flights.grid import pwm_thrust
 from openjax.flights.pairs import FULL
 from openjax.flights.signals import RATE, clock_of, first_order, in_band, on_clock
 from openjax.flights.track import GRAVITY, to_body
+from openjax.gap.decision import DECISION
 
 CLEAR_OF_FLOOR = 0.25  # m, where the ground's cushion is gone
 SETTLED = 0.5  # s after a stretch's begin and before its end that are left out
 BLOCK = 2.0  # s, over which rows of a flight count as one
 TURNING = (1.0, 10.0)  # Hz, where motors turn the vehicle
 DELAYS = (0, 2, 4, 6)  # rows, of the commands as instruments
-# share of the regressors that commands must explain: weak instruments bias (Staiger,
-# Stock 1997)
-LEAST_EXCITED = 0.7
 # Hz, where the rate loop's proportional part outweighs its integral
 ANSWERING = (4.0, 15.0)
 LAGS = np.geomspace(0.004, 0.2, 40)  # s, time constants that are tried
@@ -220,7 +218,7 @@ def _loop(torque, rates, commands) -> dict:
     for part in np.array_split(band, 4):
         target, regressors, instruments = np.split(part.reshape(-1, len(signals)), (1, 3), axis=1)
         projection = instruments @ np.linalg.lstsq(instruments, regressors, rcond=None)[0]
-        if min((projection**2).sum(0) / (regressors**2).sum(0)) < LEAST_EXCITED:
+        if min((projection**2).sum(0) / (regressors**2).sum(0)) < DECISION.least_excitation:
             return {}
         gains.append(np.linalg.lstsq(projection, target[:, 0], rcond=None)[0][0])
     if min(gains) <= 0:

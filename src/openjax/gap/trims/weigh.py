@@ -10,9 +10,6 @@ from openjax.gap.decision import DECISION
 from openjax.gap.trims.causes import CAUSES, SIDES, Hypotheses, trims_with
 from openjax.gap.trims.change import Interval
 
-# before any flight speaks, a change is as probable as none
-PRIOR_CHANGED = 0.5
-
 
 @dataclass(frozen=True)
 class Weighed:
@@ -88,8 +85,8 @@ def weigh(
         difference - hypotheses.change
     )
     top = max(each.max(), none)
-    posterior = PRIOR_CHANGED * np.exp(each - top)
-    total = posterior.sum() + (1.0 - PRIOR_CHANGED) * np.exp(none - top)
+    posterior = DECISION.change_prior * np.exp(each - top)
+    total = posterior.sum() + (1.0 - DECISION.change_prior) * np.exp(none - top)
     probability = float(posterior.sum() / total)
     posterior /= posterior.sum()
     causes = {c: float(posterior[hypotheses.cause == k].sum()) for k, c in enumerate(CAUSES)}
