@@ -10,8 +10,9 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from openjax.gap.channels import Estimated
+from openjax.gap.decision import DECISION
 from openjax.gap.intervals import _estimate
-from openjax.gap.model.bounds import BOUND, solve_bounded
+from openjax.gap.model.bounds import solve_bounded
 from openjax.gap.model.library import ABSENT, CARDS, STEP, THETA, places, prior
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.effects import EFFECTS
@@ -67,14 +68,14 @@ def test_bounded_least_squares_agree_with_scipy():
             [rng.standard_normal((size, size)) * 10.0 ** rng.uniform(-2, 2, size), np.eye(size)]
         )
         target = root @ (5.0 * rng.standard_normal(size))
-        limits = np.full(size, BOUND)
+        limits = np.full(size, DECISION.nuisance_bound)
         limits[:free] = np.inf
         found = solve_bounded(root.T @ root, root.T @ target, free)
         best = lsq_linear(root, target, (-limits, limits), method="bvls", tol=1e-14)
         np.testing.assert_allclose(
             ((root @ found - target) ** 2).sum(), 2.0 * best.cost, rtol=1e-9, atol=1e-9
         )
-        assert (np.abs(found[free:]) <= BOUND * (1 + 1e-6)).all()
+        assert (np.abs(found[free:]) <= DECISION.nuisance_bound * (1 + 1e-6)).all()
 
 
 def seems(effect, deviation=1e-6, **value):

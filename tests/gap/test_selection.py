@@ -107,7 +107,7 @@ def test_what_only_a_sum_is_known_of_is_clear_by_the_sum():
 
 
 def test_intervals_hold_a_mean_that_three_flights_differ_by():
-    """Flights as loud as usual: `DISPERSION` variances of what their rows say."""
+    """Flights as loud as usual: `dispersion` variances of what their rows say."""
     rng = np.random.default_rng(4)
     covariance = np.eye(1) / 3.0
     flights = np.sqrt(2.6) * rng.standard_normal((4000, 3))

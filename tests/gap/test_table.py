@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from openjax.gap.model.bounds import BOUND
+from openjax.gap.decision import DECISION
 from openjax.gap.model.cross_validation import Equations, cross_validate, promise, promise_unbounded
 from openjax.gap.model.hypotheses import _loudness
 from openjax.gap.model.library import ABSENT
@@ -77,12 +77,13 @@ def test_nuisances_of_the_vehicle_are_alike_on_all_blocks_and_bounded_and_a_bloc
             value += 0.5 * ((r - step @ x[2:3] - common @ x[5:7] - own[k] * x[7]) ** 2).sum()
         return value
 
-    bounds = [(None, None)] + [(-BOUND, BOUND)] * 2 + [(None, None)] * 2
+    bound = DECISION.nuisance_bound
+    bounds = [(None, None)] + [(-bound, bound)] * 2 + [(None, None)] * 2
     best = minimize(objective, np.zeros(5), bounds=bounds, options={"ftol": 1e-14})
     np.testing.assert_allclose(
         objective(np.array([*found, *(-u for u in own)])), best.fun, rtol=1e-6
     )
-    assert np.abs(found[1:]).max() <= BOUND
+    assert np.abs(found[1:]).max() <= bound
 
 
 def test_a_block_left_out_is_judged_by_its_marginal_density(columns):
@@ -111,5 +112,5 @@ def test_screening_promises_what_a_fit_does_where_no_nuisance_is_at_its_bound(co
     model = Model((), np.array([1, 2]), np.array([0.1, -0.2]), np.diag([4.0, 9.0]))
     nothing = Model((), np.array([], int), np.zeros(0), np.zeros((0, 0)))
     gains = [f(table, model) - f(table, nothing) for f in (promise_unbounded, promise)]
-    assert np.abs(Equations(table, model).solve(table.total)[2][2:]).max() < BOUND
+    assert np.abs(Equations(table, model).solve(table.total)[2][2:]).max() < DECISION.nuisance_bound
     assert gains[0] == pytest.approx(gains[1], rel=1e-6)

@@ -14,7 +14,6 @@ from openjax.gap.criteria import DETECTABLE
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence, gather, with_identification
 from openjax.gap.intervals import estimates, links
-from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.library import ABSENT, CARDS, PLACE, forbidden, library, path_of
 from openjax.gap.planning.beliefs import acts_in_physics
 from openjax.gap.probabilities import agreeing, probabilities
@@ -297,7 +296,7 @@ def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
     sizes = selection.hypothesis.validation.nuisance_sizes.mean(0)
 
     def at(v):
-        return ", at its bound" if abs(v) > 0.99 * BOUND else ""
+        return ", at its bound" if abs(v) > 0.99 * DECISION.nuisance_bound else ""
 
     entries = {
         n: f"{v:+.2f} of its usual size{at(v)}"

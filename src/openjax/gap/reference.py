@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 
 from openjax.errors import UserError
 from openjax.flights.flight import Case
-from openjax.gap.channels import DISPERSION, Channel
+from openjax.gap.channels import Channel
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence, gather, with_identification
 from openjax.gap.model.baseline import FORM, Baseline, day_of, transfer
@@ -156,10 +156,10 @@ def _another_day(evidence: Evidence, fit: SetFit, effects) -> tuple[tuple[str, .
     names += shared_names
     unit = np.array([1.0] * inside + [sizes.get(n, 1.0) for n in shared_names])
     # Of the parameters themselves, whatever the columns' units.
-    hessian = table.total[np.ix_(columns, columns)] / DISPERSION
+    hessian = table.total[np.ix_(columns, columns)] / DECISION.dispersion
     precision = block_diag(model.precision, np.eye(len(columns) - inside))
     around = np.concatenate([model.mean, np.zeros(len(columns) - inside)])
-    push = table.total[columns, 0] / DISPERSION - hessian @ around
+    push = table.total[columns, 0] / DECISION.dispersion - hessian @ around
     days = np.ones(len(columns))
     for k in np.flatnonzero(transfers):
         effect, parameter = names[k].split(" ")

@@ -20,7 +20,6 @@ from openjax.flights.shapes import Chosen
 from openjax.flights.track import Track, specific_force_of, to_body
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
-from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.hypotheses import SetFit, without_nuisances
 from openjax.gap.model.nuisances import SIZE
 from openjax.gap.model.replay import FORCE, RATES, SKIP, VELOCITY
@@ -230,7 +229,7 @@ def _comparable(evidence: Evidence) -> dict[str, float]:
     shift = _shift(channels.get("estimator"))
     reference_shift = _shift(baseline.channels.get("estimator"))
     # What is late also jitters, which no shift takes away.
-    if abs(shift - reference_shift) > BOUND * SIZE["pose_clock"]:
+    if abs(shift - reference_shift) > DECISION.nuisance_bound * SIZE["pose_clock"]:
         silent += ("estimator", "accelerometer")
         silent += ("position",) if shift > reference_shift else ()
     return {n: v for n, v in baseline.measures.items() if n not in silent}

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from openjax.flights.regimes import REGIMES, regimes_of
 from openjax.flights.track import smooth
+from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import ABSENT, places
@@ -25,8 +26,6 @@ CHANNELS = (
     "estimator",
     "firmware",
 )
-LEAST_TIME = 0.5  # s in a regime, or it isn't judged
-STANDS_OUT = 1.15  # times the noise floor: less is no place of a gap
 CALM = 0.12  # s over which the rest is smoothed: sensor noise out, causes in
 
 
@@ -61,7 +60,7 @@ def locate(evidence: Evidence, fit: SetFit, nothing: SetFit, effects=()) -> list
     powers_of |= _other_powers(evidence, effects)
     for channel, powers in powers_of.items():
         floor = powers[2].mean() + 1e-18
-        for regime in (r for r in REGIMES if seconds[r] >= LEAST_TIME):
+        for regime in (r for r in REGIMES if seconds[r] >= DECISION.place_seconds):
             b, a = (float(p[inside[regime]].mean() / floor) for p in powers[:2])
             excess = max(b - 1.0, 0.0) * seconds[regime]
             places.append(Place(channel, regime, excess, b**0.5, a**0.5, seconds[regime]))
@@ -116,10 +115,10 @@ def without_nuisances(
         name: np.sqrt(of_nothing[name].mean() / (floor.mean() + 1e-18))
         for name, (_, _, floor) in powers_of.items()
     }
-    if max(growth.values()) < STANDS_OUT:
+    if max(growth.values()) < DECISION.place_growth:
         return powers_of
     return {
-        name: [of_nothing[name] if growth[name] < STANDS_OUT else powers[0], *powers[1:]]
+        name: [of_nothing[name] if growth[name] < DECISION.place_growth else powers[0], *powers[1:]]
         for name, powers in powers_of.items()
     }
 
@@ -159,7 +158,7 @@ def in_words(places: list[Place]) -> str:
     """The two largest cells as text."""
     words = {"force": "force along body", "torque": "torque about body"}
     parts = []
-    for place in (p for p in places[:2] if p.share >= 0.02 and p.before >= STANDS_OUT):
+    for place in (p for p in places[:2] if p.share >= 0.02 and p.before >= DECISION.place_growth):
         kind, _, axis = place.channel.partition("_")
         name = f"{words[kind]} {axis}" if kind in words else place.channel
         regime = place.regime.replace("_", " ")

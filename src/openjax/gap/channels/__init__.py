@@ -12,11 +12,6 @@ from scipy.stats import t as student
 
 from openjax.gap.decision import DECISION
 
-# By how much flights usually differ, in variances of white residuals, whose median share
-# is .38; it counts as so many flights more.
-DISPERSION = 2.6
-USUAL_FLIGHTS = 4.0
-
 
 @dataclass(frozen=True)
 class Estimated:
@@ -100,8 +95,8 @@ def of_flights(
     Smyth 2004); widened, so that 90 % intervals are Student's.
     """
     count = max(len(pushes), 1)
-    freedom = USUAL_FLIGHTS + count - 1
-    total = USUAL_FLIGHTS * DISPERSION * covariance
+    freedom = DECISION.usual_flights + count - 1
+    total = DECISION.usual_flights * DECISION.dispersion * covariance
     if count > 1:
         total = total + (count - 1) * sandwich(covariance, pushes)
     return few(freedom + 1.0) ** 2 * total / freedom

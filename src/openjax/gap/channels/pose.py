@@ -9,12 +9,12 @@ import numpy as np
 from openjax.flights.track import Track, earlier, smooth, turn_increments
 from openjax.gap.channels import Channel, Estimated
 from openjax.gap.decision import DECISION
-from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.library import CARDS
 from openjax.gap.model.nuisances import SIZE
 from openjax.gap.model.whitening import fit_noise, whiten
 
-DELAY_SPREAD = 0.02  # s
+# s, from the effect's card
+(DELAY_SPREAD,) = (p.spread for c in CARDS.values() if c.path == "estimator" for p in c.fitted)
 LONGEST = 0.15  # s
 STEPS = 6
 SMALL_STEP = 2e-4  # s
@@ -81,7 +81,7 @@ def read_pose(tracks: list[Track], library) -> Pose | None:
     """The pose's channel; None without an attitude."""
     if not all(t.logs_attitude for t in tracks):
         return None
-    clock = BOUND * SIZE["pose_clock"] + max(t.pose_age for t in tracks)
+    clock = DECISION.nuisance_bound * SIZE["pose_clock"] + max(t.pose_age for t in tracks)
     steps = tuple(max(round(POSE_HORIZON / t.dt), 1) for t in tracks)
     return Pose(read_delay(tracks), clock, library.of("estimator"), steps)
 

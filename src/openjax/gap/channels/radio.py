@@ -17,8 +17,6 @@ from openjax.gap.model.library import CARDS
 LONGEST_DELAY = 0.1  # s
 DELAY_STEP = 0.0005  # s
 TOLERANCE = 3e-4  # of thrust: rounding of the logs and of the firmware's integers
-# of thrust: mean misfit above which motors and commands aren't one stream
-READABLE = 3e-3
 # smallest change of commanded thrust that shows what the link does at all
 INFORMATIVE = 1.5e-3
 # of the way from the command held to the one due: up to HELD it is held, up to BETWEEN
@@ -26,9 +24,6 @@ INFORMATIVE = 1.5e-3
 HELD = 0.2
 BETWEEN = 0.6
 DEPENDENT = 3.0  # rows that count as one independent error
-FEWEST = 30  # changes of the command that tell what a link does
-# nats that a delay or losses must gain: errors of a link aren't independent
-CLEAR = 20.0
 # of a row, by which a delay is known where rows are means, and where they are single
 # samples: the deviation of a uniform distribution over one row is 1 / sqrt(12) of it
 ROW_ERROR = (0.1, 0.29)
@@ -97,7 +92,7 @@ class Radio(Channel):
     @property
     def readable(self) -> bool:
         """True if the motors' stream follows the commands closely enough to tell single packets."""
-        return self.links[frozenset({DELAY, LOSS})].misfit < READABLE
+        return self.links[frozenset({DELAY, LOSS})].misfit < DECISION.link_misfit
 
     @property
     def off_nominal(self) -> frozenset:
@@ -109,10 +104,10 @@ class Radio(Channel):
             return frozenset()
         both = frozenset({DELAY, LOSS})
         gain = {p: self.links[both].nats - self.links[both - {p}].nats for p in both}
-        late = self.delay > DECISION.clock and gain[DELAY] > CLEAR
+        late = self.delay > DECISION.clock and gain[DELAY] > DECISION.link_nats
         loses = (
             self.loss > DECISION.packet_loss
-            and gain[LOSS] > CLEAR
+            and gain[LOSS] > DECISION.link_nats
             and self.losing.ambiguous_rows.sum() < 0.5 * self.losing.lost_rows.sum()
         )
         return frozenset(p for p, on in ((DELAY, late), (LOSS, loses)) if on and p in self.names)
@@ -126,7 +121,8 @@ class Radio(Channel):
         return {self.names[p]: 1.0 - DECISION.unknown for p in sorted(self.off_nominal)}
 
     def undetectable(self) -> list[str]:
-        changes_enough = self.links[frozenset({DELAY, LOSS})].informative.sum() >= FEWEST
+        changes = self.links[frozenset({DELAY, LOSS})].informative.sum()
+        changes_enough = changes >= DECISION.link_changes
         return [] if self.readable and changes_enough else list(self.names.values())
 
     def estimate(self, effect: str, parameter: str) -> Estimated:

@@ -26,9 +26,10 @@ from openjax.gap.model.observer import GYRO_GAIN, TICKS, observe
 from openjax.gap.model.prediction import bucket, pad
 
 GAIN_STEP = 0.05
-# Spreads of the gains, of P's delay and of the share of the derivative that is
-# filtered.
-PRIOR = np.array([0.4, 0.4, 0.4, 1.0, 1.0])
+# Spreads of the gains, from the effect's card, of P's delay and of the share of the
+# derivative that is filtered.
+SPREADS = [p.spread for card in CARDS.values() if card.path == "rate_loop" for p in card.fitted]
+PRIOR = np.array([*SPREADS, 1.0, 1.0])
 # Hz of the low-pass of the derivative that the firmware of the Crazyflie may have
 FILTER = 30.0
 # s by which motors may be off, where rows are the log's own and where they are means of
@@ -36,13 +37,6 @@ FILTER = 30.0
 ROW_DELAY = (0.0005, 0.0025)
 MARGIN = 0.05  # of a motor command: nearer to its limits some tick of the row was cut
 SEGMENT = 0.5  # s, unit of the errors
-# By how much what commands make of P's input must exceed the gyroscope's noise in it.
-# The loop answers the noise of ticks that no row shows, and what is commanded in a
-# hover answers that, so healthy gains look smaller: by a third at a fifth of the noise
-# and in slow passes (2.5 times it), by less than forms are wrong by from 5 times on,
-# and not in quick turns (9 times).
-ABOVE_NOISE = 5.0
-LEAST_SECONDS = 6  # without a motor at its limit
 # s over which what pushes the body is smoothed, run by run; where rows are means, which
 # the ticks follow anyway, the first is enough
 PUSHES = (SLOW, TRIM, TRIM, TRIM)
@@ -222,8 +216,8 @@ def read_gains(reading, series, ticks) -> tuple[np.ndarray, np.ndarray]:
         segment_moments = np.array([m for a in axes for m, _ in moments[a]])
         units = np.array([3 * u + a for a in axes for _, u in moments[a]])
         signal, noise = power[:, axes].sum(1)
-        excites = signal > ABOVE_NOISE**2 * noise
-        if excites and len(segment_moments) * SEGMENT >= LEAST_SECONDS * len(axes):
+        excites = signal > DECISION.loop_signal**2 * noise
+        if excites and len(segment_moments) * SEGMENT >= DECISION.loop_seconds * len(axes):
             columns = slice(3 * group, 3 * group + 3)
             theta, deviation = _moments(segment_moments, units)
             change[columns], error[columns] = theta[:3], deviation[:3]

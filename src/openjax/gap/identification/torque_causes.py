@@ -187,15 +187,15 @@ def _columns(*rows: int) -> np.ndarray:
 
 
 CAUSES = (
-    Cause(LAG, _columns(0, 1), np.array([[0.16, 0.12], [0.12, 0.16]]), -3.0),
-    Cause(LATE, _columns(2), np.array([[0.03**2]]), -3.0),
+    Cause(LAG, _columns(0, 1), np.array([[0.16, 0.12], [0.12, 0.16]]), CARDS[LAG].log_odds),
+    Cause(LATE, _columns(2), np.array([[0.03**2]]), CARDS[LAG].log_odds),
     Cause(
         INERTIA,
         _columns(3, 4, 5) * np.array([1.0, 1.0, -1.0]),
         0.35**2 * (0.8 * np.ones((3, 3)) + 0.2 * np.eye(3)),
-        -3.0,
+        CARDS[INERTIA].log_odds,
     ),
-    Cause(YAW, _columns(5), np.array([[0.25]]), -3.0),
+    Cause(YAW, _columns(5), np.array([[0.25]]), CARDS[YAW].log_odds),
 )
 """Spreads cover what the effects' cards call usual: phases of lags up to 120 ms, moments
 of .5 to 2 times the assumed ones.

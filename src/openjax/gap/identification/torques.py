@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from openjax.flights.track import Track
+from openjax.gap.decision import DECISION
 from openjax.gap.identification.prediction_errors import Problem, earlier
 from openjax.gap.identification.row_errors import HALF_CYCLE
 from openjax.gap.identification.search import TorqueFit, begin, earliest, search
@@ -10,10 +11,6 @@ from openjax.gap.identification.search import TorqueFit, begin, earliest, search
 FAST_ROWS = 0.005  # s: slower rows show 2 ms of delay in its place
 AHEAD = (0.006, 0.012, 0.02, 0.04, 0.08)  # s by which motors are tried earlier than logged
 LATE = (0.002, 0.03)  # s, starts of the delay
-# of the nominal gain; the heaviest decks and duty cycles leave about as much
-STRONG = 0.45
-SOON = 0.12  # s; the slowest motors that fly
-CLEARLY = 10.0  # nats by which motors logged too late must be better
 
 
 def identify_torques(records: list[Track], one_clock: bool = True) -> TorqueFit:
@@ -26,7 +23,7 @@ def identify_torques(records: list[Track], one_clock: bool = True) -> TorqueFit:
         # Whether such rows are of the filtered gyroscope nobody says, but they show it.
         low_pass_problem = Problem(records, low_pass=True)
         others = _first_fits(low_pass_problem)
-        if _best(base, others).loss < _best(base, fits).loss - CLEARLY:
+        if _best(base, others).loss < _best(base, fits).loss - DECISION.clock_nats:
             base, fits = low_pass_problem, others
     first = _best(base, fits)
     is_late = all(_begins(base, rows, fit) for rows, fit in fits.items())
@@ -79,7 +76,8 @@ def _earlier_fit(base: Problem, rows: int) -> TorqueFit:
     fit = search(problem, begin(problem, LATE[0]))
     value = fit.value.copy()
     value[2] -= rows * base.dt
-    return replace(fit, value=value, loss=_comparable(fit.loss, problem, base) + CLEARLY)
+    loss = _comparable(fit.loss, problem, base) + DECISION.clock_nats
+    return replace(fit, value=value, loss=loss)
 
 
 def _comparable(loss: float, problem: Problem, base: Problem) -> float:
@@ -92,4 +90,5 @@ def _clear(fit: TorqueFit) -> bool:
     vehicle: then the rows' clock is right to a few milliseconds, and no other need be
     tried.
     """
-    return bool(fit.value[3:5].min() > STRONG and fit.value[:2].max() < SOON)
+    is_strong = fit.value[3:5].min() > DECISION.strong_gain
+    return bool(is_strong and fit.value[:2].max() < DECISION.slow_lag)

@@ -21,10 +21,6 @@ from openjax.vehicle.effects.effect import growth
 # any day. Trims of 1 to 2.5 % of hover were measured over days on published flights of
 # two Crazyflies.
 FORM = tuple(e for e in PHYSICS_EFFECTS if CARDS[e].days is not None)
-# Of what a number is usually off by, by which two sets of flights of one vehicle tell
-# it differently. With .5 thirty numbers of five development cases in which nothing acts
-# lay 1.4 standard deviations from their reference, rms.
-FORM_DAYS = 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +71,10 @@ def day_of(effect: str, parameter: str, vehicle, silent: bool) -> float:
     spread *= growth(EFFECTS[effect].parameters[parameter].unit, vehicle)
     charge = entry.nuisance.duty_cycles if silent and "thrust_map" in card.needs else None
     return max(
-        charge or 0.0, card.days or 0.0, FORM_DAYS * usual, DECISION.form_error * float(spread)
+        charge or 0.0,
+        card.days or 0.0,
+        DECISION.day_share * usual,
+        DECISION.form_error * float(spread),
     )
 
 

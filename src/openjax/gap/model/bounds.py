@@ -5,7 +5,8 @@ wants more is a finding.
 import numpy as np
 from jaxtyping import Float
 
-BOUND = 2.0  # usual sizes that a nuisance may take
+from openjax.gap.decision import DECISION
+
 # tries in which no fewer entries are wrong, after which they are let go one by one
 PATIENCE = 4
 
@@ -15,20 +16,20 @@ def solve_bounded(
     push: Float[np.ndarray, " entries"],
     free: int = 0,
 ) -> Float[np.ndarray, " entries"]:
-    """Minimum of x'Hx/2 - push'x with |x| <= BOUND beyond the first `free` entries, H
-    positive definite.
+    """Minimum of x'Hx/2 - push'x with |x| within the bound of nuisances beyond the first
+    `free` entries, H positive definite.
 
     Block principal pivoting (Judice, Pires 1994): entries that leave the box are fixed
     at its edge and those that would come back are let go, all at once as long as fewer
     are wrong each time, else the last of them alone, so that it ends.
     """
-    limit = np.full(len(push), BOUND)
+    limit = np.full(len(push), DECISION.nuisance_bound)
     limit[:free] = np.inf
     side = np.zeros(len(push))
     fewest = len(push) + 1
     patience = PATIENCE
     while True:
-        solution = np.where(side == 0.0, 0.0, side * BOUND)
+        solution = np.where(side == 0.0, 0.0, side * DECISION.nuisance_bound)
         inside = np.flatnonzero(side == 0.0)
         at_bound = np.flatnonzero(side)
         right = push[inside] - hessian[np.ix_(inside, at_bound)] @ solution[at_bound]

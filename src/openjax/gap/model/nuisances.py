@@ -10,7 +10,6 @@ from jaxtyping import Float
 
 from openjax.flights.track import GRAVITY, Track, smooth, specific_force_of, to_world
 from openjax.gap.decision import DECISION
-from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.physics import Path
 from openjax.gap.model.prediction import FORCE, RATES, VELOCITY
 from openjax.gap.shapes import Rows
@@ -21,7 +20,7 @@ SIZE = {
         pathlib.Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
     ).items()
 }
-UNKNOWN_GAIN = DECISION.gyroscope_gain / BOUND
+UNKNOWN_GAIN = DECISION.gyroscope_gain / DECISION.nuisance_bound
 """Of a gyroscope that no attitude was logged beside: nothing else tells its gain from
 another inertia about all axes.
 """

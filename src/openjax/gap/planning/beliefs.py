@@ -8,16 +8,11 @@ import numpy as np
 from openjax.errors import UserError
 from openjax.flights.segments import SEGMENTS
 from openjax.gap.criteria import DETECTABLE
+from openjax.gap.decision import DECISION
 from openjax.gap.model.library import ABSENT, CARDS, PLACE, places
 from openjax.gap.planning.information import SECONDS, Advice, Belief, advise
 from openjax.vehicle.vehicle_file import VehicleFile
 
-LEAST = 0.02  # probability below which a cause isn't asked for
-UNTESTED = 0.05  # of each effect that the flights couldn't show
-OPEN = 0.2
-"""Probability that two causes drawn from what is believed differ, below which no flight
-is worth its battery: none can tell more apart than that.
-"""
 SCALE_ONLY = {"mass", "thrust_scale", "thrust_curve"}
 """A scale tells these apart, no flight."""
 
@@ -52,22 +47,24 @@ def beliefs_of(report: dict) -> list[Belief]:
     """
     chances = report["probabilities"]
     causes = [e for e in report.get("effects", ()) if acts_in_physics(e)]
-    chances_of: dict[tuple[str, ...], float] = {(): max(chances.get("none", 0.0), UNTESTED)}
+    chances_of: dict[tuple[str, ...], float] = {
+        (): max(chances.get("none", 0.0), DECISION.least_belief)
+    }
     # what a report names is believed together, as it was found together
     if causes:
         sure = max(chances.get(e, 0.0) for e in causes)
-        chances_of[tuple(causes)] = max(sure, UNTESTED)
+        chances_of[tuple(causes)] = max(sure, DECISION.least_belief)
         for effect in causes:
             for other in filter(acts_in_physics, report.get("equivalent", {}).get(effect, ())):
                 # As likely as the one that it would do as well as.
                 rest = tuple(e for e in causes if e != effect)
-                chances_of[(*rest, other)] = max(chances.get(effect, 0.0), UNTESTED)
+                chances_of[(*rest, other)] = max(chances.get(effect, 0.0), DECISION.least_belief)
     for effect, chance in chances.items():
-        if acts_in_physics(effect) and effect not in causes and chance > LEAST:
+        if acts_in_physics(effect) and effect not in causes and chance > DECISION.least_rival:
             chances_of.setdefault((effect,), chance)
     # what those flights couldn't show they don't speak against, either
     for effect in filter(acts_in_physics, report.get("not_testable", ())):
-        chances_of.setdefault((effect,), UNTESTED)
+        chances_of.setdefault((effect,), DECISION.least_belief)
     whole = sum(chances_of.values())
     return [Belief(e, _theta(e, report["parameters"]), p / whole) for e, p in chances_of.items()]
 
@@ -111,7 +108,7 @@ def advice_for(report: dict, vehicle_file: VehicleFile) -> tuple[str, Advice]:
 
 def is_open(beliefs: list[Belief]) -> bool:
     """True if enough is left open for a flight."""
-    return 1.0 - sum(b.probability**2 for b in beliefs) >= OPEN
+    return 1.0 - sum(b.probability**2 for b in beliefs) >= DECISION.open_question
 
 
 def next_flight(report: dict, vehicle_file: VehicleFile) -> str:

@@ -21,6 +21,7 @@ from openjax.flights.reading import flights_of
 from openjax.flights.samples import Turbulence, fly, log_of
 from openjax.flights.segments import SEGMENTS
 from openjax.gap.criteria import DETECTABLE
+from openjax.gap.decision import DECISION
 from openjax.gap.evidence import gather
 from openjax.gap.model.library import library, places, prior
 from openjax.gap.model.replay import Replay
@@ -28,7 +29,6 @@ from openjax.vehicle.vehicle_file import VehicleFile
 from openjax.vehicle.vehicle_tables import Motor
 
 SECONDS = 10.0  # of each segment that are simulated
-ENOUGH = 0.98  # of what all segments tell together
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +116,7 @@ def _fewest(apart: np.ndarray, together: np.ndarray) -> list[int]:
     everything = value(apart.sum(0))
     picks: list[int] = []
     sums = np.zeros_like(together)
-    while value(sums) < ENOUGH * everything and len(picks) < len(apart):
+    while value(sums) < DECISION.plan_share * everything and len(picks) < len(apart):
         rest = [k for k in range(len(apart)) if k not in picks]
         picks.append(max(rest, key=lambda k: value(sums + apart[k])))
         sums = sums + apart[picks[-1]]
