@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from openjax.gap.decision import DECISION
-from openjax.gap.identification.changes import change_of, comparable
+from openjax.gap.identification.changes import GAIN_OF_LAG, change_of, comparable
 from openjax.gap.identification.estimates import TORQUES, EffectEstimates, of_fit
 from openjax.gap.identification.quantities import TALKED_OF, Identification
 from openjax.gap.model.library import CARDS, PLACE
@@ -301,7 +301,7 @@ def _usual(estimate: Estimate, pwm: bool) -> Estimate:
     sizes = [SIZE["spin_up"] * phase, SIZE["spin_down"] * phase, 0.0]
     sizes += [SIZE["inertia"], SIZE["inertia"], SIZE["yaw"]]
     estimate = estimate.with_doubts(np.eye(len(NAMES)), sizes)
-    ridge = np.array([phase / 0.025, phase / 0.025, 0.0, -35.0, -35.0, 0.0])
+    ridge = np.array([phase / 0.025, phase / 0.025, 0.0, GAIN_OF_LAG, GAIN_OF_LAG, 0.0])
     estimate = estimate.with_doubts(
         np.stack([ridge, ALIKE], 1), [SIZE["lag_and_gain"], SIZE["duty_slope"] if pwm else 0.0]
     )
