@@ -39,17 +39,20 @@ class Cause:
     what: str = ""
 
 
-# People knock propellers and tape things on more often than they swap motors, and
-# motors wear. Drag and inertia, .11 of all changes, move nothing of this; a diagnosis
-# names them. Gains it often can't, as it asks for quick turns.
+# Drag and inertia move nothing of this; a diagnosis names them. Gains it often can't, as
+# it asks for quick turns.
 CAUSES = {
-    "one rotor weaker": Cause(0.25, ("motor_imbalance",), damage=True),
-    "two rotors weaker": Cause(0.2, ("motor_imbalance",), damage=True),
-    "weight": Cause(0.15, ("mass", "com_offset"), damage=True),
-    "whole vehicle": Cause(0.1, ("mass", "thrust_scale")),
-    "motors": Cause(0.06, ("motor_lag",), False, ("lag",), (0.2, 0.5), "motors' lag"),
-    "gains": Cause(0.06, ("rate_gains",), False, ("loop_gain",), (0.0, 0.5), "rate gains"),
-    "something else": Cause(0.07),
+    "one rotor weaker": Cause(DECISION.rotor_prior, ("motor_imbalance",), damage=True),
+    "two rotors weaker": Cause(DECISION.rotors_prior, ("motor_imbalance",), damage=True),
+    "weight": Cause(DECISION.weight_prior, ("mass", "com_offset"), damage=True),
+    "whole vehicle": Cause(DECISION.vehicle_prior, ("mass", "thrust_scale")),
+    "motors": Cause(
+        DECISION.motors_prior, ("motor_lag",), False, ("lag",), (0.2, 0.5), "motors' lag"
+    ),
+    "gains": Cause(
+        DECISION.gains_prior, ("rate_gains",), False, ("loop_gain",), (0.0, 0.5), "rate gains"
+    ),
+    "something else": Cause(DECISION.other_prior),
 }
 LOOP_WITH_MOTORS = 0.3  # standard deviation: motors move the estimate of the gain too
 # mean and standard deviation of the rise of the logarithm with a damage
