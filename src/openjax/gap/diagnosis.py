@@ -15,7 +15,7 @@ from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence, gather, with_identification
 from openjax.gap.intervals import estimates, links
 from openjax.gap.model.library import ABSENT, CARDS, PLACE, forbidden, library, path_of
-from openjax.gap.planning.beliefs import acts_in_physics
+from openjax.gap.planning.beliefs import beside_segments
 from openjax.gap.probabilities import agreeing, probabilities
 from openjax.gap.reference import OF_DAYS, borne_out, differs, join, read_reference, trimmed_before
 from openjax.gap.report import Report
@@ -73,20 +73,21 @@ def _diagnose(case: Case, without, progress, reference, trims) -> Report:
 def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
     """The report that the evidence supports, beside what `trims` say changed."""
     evidence, selection = agreed(evidence)
-    acting = {e: selection.probability(e) for e in selection.effects}
+    effects = selection.effects
+    theta = selection.fit.theta
+    vehicle = evidence.vehicles[0]
+    acting = {e: selection.probability(e) for e in effects}
     acting |= {
         e: p
         for channel in evidence.channels
         for e, p in channel.named_effects().items()
         if differs(channel, e, evidence.baseline)
     }
+    of_days = trimmed_before(theta, effects, evidence.baseline, vehicle, trims)
+    old = of_days | forbidden(theta, effects, vehicle)
     check = check_residual(evidence, selection.fit, selection.search.nothing.fit)
-    theta = selection.fit.theta
-    vehicle = evidence.vehicles[0]
-    of_days = trimmed_before(theta, selection.effects, evidence.baseline, vehicle, trims)
-    old = of_days | forbidden(theta, selection.effects, vehicle)
     if check.mostly_unknown:  # what acts is something else
-        old |= set(selection.effects) - selection.search.torque_effects
+        old |= set(effects) - selection.search.torque_effects
     candidates = [e for e, p in acting.items() if p >= DECISION.least_probability and e not in old]
     parts = worth_naming(
         lambda names: split(evidence, selection, check.excess, names),
@@ -96,33 +97,19 @@ def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
     present = {e: acting[e] for e in parts.effects}
     rejects = (set(candidates) | old) - set(present)
     weights = Counter()
-    for effects, weight in selection.weights.items():
+    for visited, weight in selection.weights.items():
         # a set with an effect that isn't worth a name stands for the rest of it
-        weights[effects - rejects] += weight
+        weights[visited - rejects] += weight
     possible = evidence.library.effects
     chances = probabilities(present, parts.largest, check.probability, weights, possible)
     sure = max((share.interval90[0] for share in parts.effects.values()), default=0.0)
     no_gap = parts.gap.probability_of_none
-    chances = agreeing(chances, words(check, parts) or ("none",), sure, no_gap)
+    answers = words(check, parts)
+    chances = agreeing(chances, answers or ("none",), sure, no_gap)
+    named = [e for e in answers if e in parts.effects]
+    reference = _reference_in_words(evidence, named, of_days, trims)
     report = _report(evidence, selection, check, parts, chances)
-    return replace(
-        report,
-        reference=report.reference + _days_in_words(report, of_days, trims),
-        identification=evidence.identification,
-        trims=trims,
-    )
-
-
-def _days_in_words(report: Report, of_days: Collection[str], trims: Change | None) -> str:
-    """A sentence on how days affect the named effects, and those that trims alone suggest."""
-    if trims is not None and of_days:
-        names = " and ".join(sorted(of_days)).replace("_", " ")
-        return f" Trims differ in the way of {names}, but by no more than they do between days."
-    if trims is None and report.reference and set(report.named) & set(OF_DAYS):
-        return (
-            " Trims move by 1 to 2.5 % of hover between days: so small a change may be the day's."
-        )
-    return ""
+    return replace(report, reference=reference, identification=evidence.identification, trims=trims)
 
 
 def agreed(evidence: Evidence) -> tuple[Evidence, Selection]:
@@ -206,6 +193,7 @@ def _report(
     equivalent = {e: selection.equivalent[e] for e in causes if e in selection.equivalent}
     second = _runner_up(chances, effects, equivalent)
     others = [o for e in causes for o in equivalent.get(e, ())]
+    alone = not any(len(t.neighbours) for t in evidence.tracks)
     return Report(
         case=evidence.case.name,
         verdict=nothing if not effects else "unknown" if effects[0] == "unknown" else "effect",
@@ -213,51 +201,60 @@ def _report(
         probabilities=chances,
         shares=parts,
         equivalent=equivalent,
-        parameters=estimates(evidence, selection.fit, causes),
-        where=locate(evidence, selection.fit, selection.search.nothing.fit, causes),
         gap=parts.gap,
         not_testable=missing,
-        to_show=_beside_segments(evidence, (*others, *missing, second)),
         quality=[
             {"flight": i.flight, "issue": i.issue, "left_out": i.refused}
             for i in evidence.case.quality
         ],
         runner_up=f"{second} ({chances[second]:.2f})" if second else "",
         rest=check.in_words(),
-        links=links(evidence),
         sensors=tuple(evidence.sensors.findings.values()),
         contradictions=tuple(
             f"{i.flight}: {i.issue}" for i in evidence.case.quality if i.kind == "garbage"
         ),
         nuisances=_nuisances(evidence, selection),
-        reference=_reference_in_words(evidence, causes),
+        parameters=estimates(evidence, selection.fit, causes),
+        links=links(evidence),
+        where=locate(evidence, selection.fit, selection.search.nothing.fit, causes),
+        to_show=beside_segments((*others, *missing, second), alone),
         residual={"p_value": check.p_value} | check.measures,
         residual_before=check.reference or {},
         plots={"evidence": evidence, "selection": selection},
     )
 
 
-def _reference_in_words(evidence: Evidence, effects) -> str:
-    """The named effects' parameters in the reference flights, and what may differ unseen between
-    days.
+def _reference_in_words(
+    evidence: Evidence, named: Collection[str], of_days: Collection[str], trims: Change | None
+) -> str:
+    """The named effects' parameters in the reference flights, what may differ unseen between
+    days, and what trims alone suggest (`of_days`).
     """
-    if evidence.baseline is None:
-        return ""
-    values = [
-        f"{e} {p} was {evidence.baseline.theta[PLACE[e, p]]:.3g} {_unit(e, p)}".strip()
-        for e in effects
-        for p in (f.name for f in CARDS[e].fitted)
-        if (e, p) in PLACE
-        and e not in OF_DAYS
-        and evidence.baseline.theta[PLACE[e, p]] != ABSENT[PLACE[e, p]]
-    ]
-    text = "Compared with the reference flights of the same vehicle"
-    text += f", in which {', '.join(values)}." if values else "."
-    battery = (
-        "The battery's charge may differ between days, and with it the thrust of a duty cycle. Log "
-        "vbat to compare thrust."
-    )
-    return f"{text} {battery}" if evidence.charge_unknown else text
+    text = ""
+    if evidence.baseline is not None:
+        values = [
+            f"{e} {p} was {evidence.baseline.theta[PLACE[e, p]]:.3g} {_unit(e, p)}".strip()
+            for e in named
+            for p in (f.name for f in CARDS[e].fitted)
+            if (e, p) in PLACE
+            and e not in OF_DAYS
+            and evidence.baseline.theta[PLACE[e, p]] != ABSENT[PLACE[e, p]]
+        ]
+        text = "Compared with the reference flights of the same vehicle"
+        text += f", in which {', '.join(values)}." if values else "."
+        if evidence.charge_unknown:
+            text += (
+                " The battery's charge may differ between days, and with it the thrust of a duty "
+                "cycle. Log vbat to compare thrust."
+            )
+    if trims is not None and of_days:
+        names = " and ".join(sorted(of_days)).replace("_", " ")
+        text += f" Trims differ in the way of {names}, but by no more than they do between days."
+    elif trims is None and text and set(named) & set(OF_DAYS):
+        text += (
+            " Trims move by 1 to 2.5 % of hover between days: so small a change may be the day's."
+        )
+    return text
 
 
 def _unit(effect: str, parameter: str) -> str:
@@ -273,18 +270,6 @@ def _runner_up(chances, effects, equivalent) -> str:
     answers = {*(effects or ("none",)), *(o for others in equivalent.values() for o in others)}
     second = max((e for e in chances if e not in answers), key=chances.get, default="")
     return second if second and chances[second] > 0.01 else ""
-
-
-def _beside_segments(evidence: Evidence, effects) -> str:
-    """Advice on flying and logging for the first of `effects` that no segment of `openjax plan`
-    shows and these loggers can reach: nobody is sent for a second vehicle.
-    """
-    alone = not any(len(t.neighbours) for t in evidence.tracks)
-    for effect in effects:
-        if effect in CARDS and not acts_in_physics(effect):
-            if not (alone and CARDS[effect].of_others):
-                return f"{effect.replace('_', ' ')}: {CARDS[effect].next_flight}"
-    return ""
 
 
 def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:

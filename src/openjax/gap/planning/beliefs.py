@@ -77,6 +77,17 @@ def acts_in_physics(effect: str) -> bool:
     return card is not None and card.path == "physics" and not card.of_others
 
 
+def beside_segments(effects, alone: bool) -> str:
+    """Advice on flying and logging for the first of `effects` that no segment shows and these
+    loggers can reach: who flies `alone` isn't sent for a second vehicle.
+    """
+    for effect in effects:
+        if effect in CARDS and not acts_in_physics(effect):
+            if not (alone and CARDS[effect].of_others):
+                return f"{effect.replace('_', ' ')}: {CARDS[effect].next_flight}"
+    return ""
+
+
 def _theta(effects, parameters: dict) -> np.ndarray:
     """(P,) with the report's values, or an effect's usual start where the report has
     none.
