@@ -4,18 +4,19 @@ a diagnosis says is brought to keep them.
 
 import dataclasses
 import functools
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from openjax.gap.decision import DECISION
-from openjax.gap.diagnosis import _beside_segments, _runner_up, worth_naming
+from openjax.gap.diagnosis import _runner_up, worth_naming
+from openjax.gap.planning.beliefs import beside_segments
 from openjax.gap.probabilities import agreeing, probabilities
 from openjax.gap.report import Estimate, Report
 from openjax.gap.report.rules import broken_rules
 from openjax.gap.shares import Gap, Share, Split
 from openjax.vehicle.effects import EFFECTS
+from tests.gap.made_reports import identification
 
 GAP = Gap("rms", 4.0, 1.2, 1.0, 0.7, (0.6, 0.8))
 
@@ -67,6 +68,17 @@ def test_a_good_report_breaks_no_rule():
 def test_each_rule_is_told_alone(words):
     (broken,) = broken_rules(dataclasses.replace(GOOD, **BROKEN[words]))
     assert broken.startswith("tuesday: ") and words in broken
+
+
+def test_torques_name_what_short_predictions_hardly_show():
+    """Alone they must be trusted; beside a reference it is what changed since."""
+    weak = {"shares": split({"inertia": (0.004, (0.003, 0.008))})}
+    for trusted, reference, breaks in (
+        (True, "", False), (False, "", True), (False, "Compared with", False),
+    ):  # fmt: skip
+        does = identification(trusted=trusted)
+        report = dataclasses.replace(GOOD, identification=does, reference=reference, **weak)
+        assert any("a share of 0.004" in words for words in broken_rules(report)) == breaks
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -134,11 +146,10 @@ def test_what_takes_a_part_of_one_channel_alone_is_named():
 
 
 def test_nobody_who_logged_one_vehicle_is_sent_for_a_second():
-    one, two = (SimpleNamespace(tracks=[SimpleNamespace(neighbours=[0] * n)]) for n in (0, 1))
-    assert "the other" not in _beside_segments(one, ("downwash", "rate_gains", ""))
-    assert "rate gains" in _beside_segments(one, ("downwash", "rate_gains", ""))
-    assert _beside_segments(one, ("downwash", "none")) == ""
-    assert "the other" in _beside_segments(two, ("downwash", "rate_gains"))
+    assert "the other" not in beside_segments(("downwash", "rate_gains", ""), alone=True)
+    assert "rate gains" in beside_segments(("downwash", "rate_gains", ""), alone=True)
+    assert "the other" in beside_segments(("downwash", "rate_gains", ""), alone=False)
+    assert beside_segments(("downwash", "none"), alone=True) == ""
 
 
 def test_the_runner_up_is_no_part_of_what_is_named():

@@ -32,9 +32,13 @@ def _testable(report: Report) -> Iterator[str]:
 
 
 def _by_torques(report: Report) -> set[str]:
-    """Effects that the torques name, whatever short predictions show of them."""
+    """Effects that the torques name, whatever short predictions show of them: torques that are
+    trusted, or that changed since the reference.
+    """
     does = report.identification
-    return set(TORQUES) if does is not None and does.trustworthy else set()
+    if does is None:
+        return set()
+    return set(TORQUES) if does.trustworthy or report.reference else set()
 
 
 def _shares(report: Report) -> Iterator[str]:
