@@ -269,7 +269,7 @@ def _runner_up(chances, effects, equivalent) -> str:
     """
     answers = {*(effects or ("none",)), *(o for others in equivalent.values() for o in others)}
     second = max((e for e in chances if e not in answers), key=chances.get, default="")
-    return second if second and chances[second] > 0.01 else ""
+    return second if second and chances[second] > DECISION.least_rival else ""
 
 
 def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
