@@ -106,8 +106,8 @@ def conclude(evidence: Evidence, trims: Change | None = None) -> Report:
     no_gap = parts.gap.probability_of_none
     answers = words(check, parts)
     chances = agreeing(chances, answers or ("none",), sure, no_gap)
-    named = [e for e in answers if e in parts.effects]
-    reference = _reference_in_words(evidence, named, of_days, trims)
+    causes = [e for e in answers if e in parts.effects]
+    reference = _reference_in_words(evidence, causes, of_days, trims)
     report = _report(evidence, selection, check, parts, chances)
     return replace(report, reference=reference, identification=evidence.identification, trims=trims)
 
@@ -225,7 +225,7 @@ def _report(
 
 
 def _reference_in_words(
-    evidence: Evidence, named: Collection[str], of_days: Collection[str], trims: Change | None
+    evidence: Evidence, causes: Collection[str], of_days: Collection[str], trims: Change | None
 ) -> str:
     """The named effects' parameters in the reference flights, what may differ unseen between
     days, and what trims alone suggest (`of_days`).
@@ -234,7 +234,7 @@ def _reference_in_words(
     if evidence.baseline is not None:
         values = [
             f"{e} {p} was {evidence.baseline.theta[PLACE[e, p]]:.3g} {_unit(e, p)}".strip()
-            for e in named
+            for e in causes
             for p in (f.name for f in CARDS[e].fitted)
             if (e, p) in PLACE
             and e not in OF_DAYS
@@ -250,7 +250,7 @@ def _reference_in_words(
     if trims is not None and of_days:
         names = " and ".join(sorted(of_days)).replace("_", " ")
         text += f" Trims differ in the way of {names}, but by no more than they do between days."
-    elif trims is None and text and set(named) & set(OF_DAYS):
+    elif trims is None and text and set(causes) & set(OF_DAYS):
         text += (
             " Trims move by 1 to 2.5 % of hover between days: so small a change may be the day's."
         )
