@@ -31,6 +31,7 @@ from openjax.gap.criteria import (
     too_small,
     worse,
 )
+from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.cross_validation import (
     Validation,
@@ -299,15 +300,13 @@ class Search:
         """Of the visited sets that are possible the one of the largest score."""
         return max(self.candidates, key=lambda h: h.score)
 
-    def clearly_worse(self, other: Hypothesis, best: Hypothesis) -> bool:
-        """True if flights tell a hypothesis from the best one, and it leaves a gap so
-        much larger that it matters.
+    def tells_apart(self, best: Hypothesis, other: Hypothesis) -> bool:
+        """True if flights tell a hypothesis from the best one, whether or not that matters for
+        the gap: nuisances may take what another effect gets wrong.
         """
-        if best.support - other.support > DETECTABLE:
-            return True
         gain, error, _ = difference(best.validation, other.validation)
-        squares = other.validation.squares.sum(0)
-        return bool(worse(gain, error, squares, best.validation.squares.sum(0)))
+        is_clear = gain > DECISION.standard_errors * error
+        return is_clear or best.support - other.support > DETECTABLE
 
     def equivalents(self, hypothesis: Hypothesis) -> dict[str, list[str]]:
         """For each named effect those in whose place, of the sets visited, flights
@@ -325,7 +324,7 @@ class Search:
                 next(iter(key - rest))
                 for key, h in self.hypotheses.items()
                 if len(key - rest) == 1 and rest < key and effect not in key
-                and is_rival(h) and not self.clearly_worse(h, hypothesis)
+                and is_rival(h) and not self.tells_apart(hypothesis, h)
             ]  # fmt: skip
             if alike:
                 out[effect] = sorted(alike)
