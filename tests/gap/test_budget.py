@@ -12,8 +12,7 @@ from openjax.vehicle.effects import EFFECTS
 
 ROOM = Path(openjax.gap.__file__).parent
 SOURCES = {path: path.read_text(encoding="utf-8") for path in sorted(ROOM.rglob("*.py"))}
-# both may only fall; those that decide rose once, when all of them came out of the
-# modules: a number that decides is new only where two of the modules' become one
+# both may only fall; those that decide rose once, when they came out of the modules
 NUMBERS = 162
 DECIDING = 66
 

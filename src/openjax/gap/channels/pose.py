@@ -9,12 +9,11 @@ import numpy as np
 from openjax.flights.track import Track, earlier, smooth, turn_increments
 from openjax.gap.channels import Channel, Estimated
 from openjax.gap.decision import DECISION
-from openjax.gap.model.library import CARDS
+from openjax.gap.model.library import CARDS, shipped_card
 from openjax.gap.model.nuisances import SIZE
 from openjax.gap.model.whitening import fit_noise, whiten
 
-# s, from the effect's card
-(DELAY_SPREAD,) = (p.spread for c in CARDS.values() if c.path == "estimator" for p in c.fitted)
+(DELAY_SPREAD,) = (p.spread for p in shipped_card("estimator").fitted)  # s
 LONGEST = 0.15  # s
 STEPS = 6
 SMALL_STEP = 2e-4  # s

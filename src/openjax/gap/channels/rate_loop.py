@@ -20,7 +20,7 @@ from openjax.flights.track import Track, smooth
 from openjax.gap.channels import Channel, Estimated, robust_deviation
 from openjax.gap.channels.instruments import BAND, COUNT, EDGE, SLOW, in_force, outputs_of
 from openjax.gap.decision import DECISION
-from openjax.gap.model.library import CARDS
+from openjax.gap.model.library import CARDS, shipped_card
 from openjax.gap.model.nuisances import TRIM
 from openjax.gap.model.observer import GYRO_GAIN, TICKS, observe
 from openjax.gap.model.prediction import bucket, pad
@@ -28,8 +28,7 @@ from openjax.gap.model.prediction import bucket, pad
 GAIN_STEP = 0.05
 # Spreads of the gains, from the effect's card, of P's delay and of the share of the
 # derivative that is filtered.
-SPREADS = [p.spread for card in CARDS.values() if card.path == "rate_loop" for p in card.fitted]
-PRIOR = np.array([*SPREADS, 1.0, 1.0])
+PRIOR = np.array([*(p.spread for p in shipped_card("rate_loop").fitted), 1.0, 1.0])
 # Hz of the low-pass of the derivative that the firmware of the Crazyflie may have
 FILTER = 30.0
 # s by which motors may be off, where rows are the log's own and where they are means of

@@ -23,6 +23,13 @@ CARDS: dict[str, Card] = {
 }
 
 
+def shipped_card(path: str) -> Card:
+    """The card of the one shipped effect of a path beside the physics: the first, as a user's own
+    effects are registered after it.
+    """
+    return next(card for card in CARDS.values() if card.path == path)
+
+
 def numbers_of(situation: Situation, vehicle) -> tuple[tuple[str, str, float], ...]:
     """(effect, parameter, usual size) of small errors of a vehicle's numbers, which are
     free in every hypothesis.
